@@ -1,0 +1,106 @@
+"""LunarLander with interventions on bounce, friction and engine power (paper Table 2).
+
+The physics, the observation and the reward are gymnasium's LunarLander-v3, discrete actions;
+an intervention changes one constant of one instance and nothing of any other.
+"""
+
+from __future__ import annotations
+
+import types
+from typing import Any
+
+import numpy as np
+from gymnasium.envs.box2d import lunar_lander as original
+from gymnasium.utils import EzPickle
+
+
+def _bind(function: types.FunctionType, **constants: float) -> types.FunctionType:
+    """``function`` with its own values for some of its module's constants.
+
+    Gymnasium keeps the engine's power in a module-level constant. Rebinding the function's
+    globals gives one environment its own value without a copy of the step's code and without
+    touching the module that every other LunarLander of the process reads.
+    """
+    return types.FunctionType(
+        function.__code__,
+        {**function.__globals__, **constants},
+        function.__name__,
+        function.__defaults__,
+        function.__closure__,
+    )
+
+
+class LunarLander(original.LunarLander):
+    """An intervened LunarLander.
+
+    Args:
+        bounce: coefficient of restitution of hull and legs, in [0, 1] (the original: 0).
+            Box2D treats contacts slower than 1 m/s as inelastic whatever the restitution.
+        friction: friction coefficient of the moon, at least 0 (the original: 0.1).
+            Box2D mixes the coefficients of two touching bodies by sqrt(f1 * f2).
+        engine_power: multiplier of the main engine's impulse, above 0 (the original: 1).
+        fixed_horizon: with a number H, an episode always lasts H steps: the state in which it
+            would have terminated absorbs, keeps its final observation, ignores actions and
+            pays nothing, and step H truncates.
+        render_mode: ``None``, ``"human"`` or ``"rgb_array"``.
+
+    Raises:
+        ValueError: a value outside the range given.
+    """
+
+    def __init__(
+        self,
+        bounce: float = 0.0,
+        friction: float = 0.1,
+        engine_power: float = 1.0,
+        fixed_horizon: int | None = None,
+        render_mode: str | None = None,
+    ):
+        if not 0.0 <= bounce <= 1.0:
+            raise ValueError(f"bounce must lie in [0, 1], not {bounce}")
+        if not (np.isfinite(friction) and friction >= 0.0):
+            raise ValueError(f"friction must be at least 0 and finite, not {friction}")
+        if not (np.isfinite(engine_power) and engine_power > 0.0):
+            raise ValueError(f"engine_power must be above 0 and finite, not {engine_power}")
+        if fixed_horizon is not None and fixed_horizon < 1:
+            raise ValueError(f"fixed_horizon must be at least 1, not {fixed_horizon}")
+        super().__init__(render_mode=render_mode)
+        EzPickle.__init__(self, bounce, friction, engine_power, fixed_horizon, render_mode)
+        self.bounce = bounce
+        self.friction = friction
+        self.engine_power = engine_power
+        self.fixed_horizon = fixed_horizon
+        self._original_step = _bind(
+            original.LunarLander.step, MAIN_ENGINE_POWER=original.MAIN_ENGINE_POWER * engine_power
+        )
+        self._steps = 0
+        self._absorbed: np.ndarray | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; observation [8] float32."""
+        self._absorbed = None
+        observation, info = super().reset(seed=seed, options=options)
+        # The lander starts high above ground: no contact exists yet that would have been
+        # created with the original coefficients.
+        for body in (self.lander, *self.legs):
+            for fixture in body.fixtures:
+                fixture.restitution = self.bounce
+        for fixture in self.moon.fixtures:
+            fixture.friction = self.friction
+        self._steps = 0
+        return observation, info
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance 1/50 s: observation [8] float32, true reward, terminated, truncated, info."""
+        if self.fixed_horizon is None:
+            return self._original_step(self, action)
+        if self._absorbed is None:
+            observation, reward, terminated, _, info = self._original_step(self, action)
+            if terminated:
+                self._absorbed = observation
+        else:
+            observation, reward, info = self._absorbed.copy(), 0.0, {}
+        self._steps += 1
+        return observation, reward, False, self._steps >= self.fixed_horizon, info

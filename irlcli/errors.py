@@ -1,0 +1,66 @@
+"""Errors that a user can act on: each carries an exit code and a hint.
+
+Every module raises these for input it cannot use; only the command line turns them into
+text and an exit status. Anything else that escapes is a defect of the program.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class IrlError(Exception):
+    """An error with a one-line message, a hint and the exit code it maps to."""
+
+    exit_code = 1
+
+    def __init__(self, message: str, hint: str = ""):
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+
+class StageFailed(IrlError):
+    """A stage could not finish its work (exit 1)."""
+
+    exit_code = 1
+
+
+class UsageError(IrlError):
+    """The request itself is wrong: an unknown name, value, setting or flag (exit 2)."""
+
+    exit_code = 2
+
+
+class NotFound(IrlError):
+    """A reference names no artefact or file, or more than one (exit 3)."""
+
+    exit_code = 3
+
+
+class IntegrityError(IrlError):
+    """Stored bytes are not what they were when published, or are not ours to read (exit 4)."""
+
+    exit_code = 4
+
+
+class Busy(IrlError):
+    """Another process holds what this one needs; trying again later will work (exit 75)."""
+
+    exit_code = 75
+
+
+class Interrupted(IrlError):
+    """Stopped by a signal after a checkpoint was written (exit 130)."""
+
+    exit_code = 130
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """A hint for a mistyped ``name``: the closest known one, or the list of all of them."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean {close[0]!r}? known: {', '.join(known)}"
+    return f"known: {', '.join(known)}"

@@ -1,0 +1,228 @@
+"""Interventions: ``leg-length=1x,2x`` as typed settings, and which knobs an environment has.
+
+A *setting* is one intervened environment instance (paper Sec. 4.1); a *knob* is the
+mechanism intervened on. Nothing here imports an environment: a name, the allowed values and
+the keyword argument they become are all the rest of the program needs to plan a run.
+
+Grammar, per comma-separated value: ``2x`` multiplies the default, ``0.5`` is absolute,
+``1.5:0.1:0.1`` is a triple, ``-10..0`` is drawn uniformly per episode.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from irlcli.errors import UsageError, suggest
+
+Kind = Literal["multiplier", "absolute", "triple", "range"]
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_FORMS: dict[Kind, re.Pattern[str]] = {
+    "multiplier": re.compile(rf"({_NUMBER})x"),
+    "absolute": re.compile(rf"({_NUMBER})"),
+    "triple": re.compile(rf"({_NUMBER}):({_NUMBER}):({_NUMBER})"),
+    "range": re.compile(rf"({_NUMBER})\.\.({_NUMBER})"),
+}
+_EXAMPLES: dict[Kind, str] = {
+    "multiplier": "2x",
+    "absolute": "0.5",
+    "triple": "1.5:0.1:0.1",
+    "range": "-10..0",
+}
+
+
+@dataclass(frozen=True)
+class Value:
+    """One intervention value: its form and its one, two or three numbers."""
+
+    kind: Kind
+    numbers: tuple[float, ...]
+
+    def __str__(self) -> str:
+        text = [_format(x) for x in self.numbers]
+        match self.kind:
+            case "multiplier":
+                return f"{text[0]}x"
+            case "triple":
+                return ":".join(text)
+            case "range":
+                return "..".join(text)
+            case _:
+                return text[0]
+
+    @property
+    def argument(self) -> float | tuple[float, ...]:
+        """What the environment's keyword argument receives."""
+        return self.numbers[0] if len(self.numbers) == 1 else self.numbers
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One mechanism of an environment that can be intervened on.
+
+    ``low`` and ``high`` bound every number of a value (inclusive); ``kinds`` are the forms
+    it accepts, the first being the usual one.
+    """
+
+    argument: str
+    kinds: tuple[Kind, ...]
+    low: float
+    high: float
+    default: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What the program knows of an environment without importing it."""
+
+    name: str
+    gym_id: str
+    max_episode_steps: int
+    knobs: dict[str, Knob] = field(default_factory=dict)
+
+
+ENVIRONMENTS: dict[str, Environment] = {
+    "lunar-lander": Environment(
+        name="lunar-lander",
+        gym_id="irlcli/LunarLander-v0",
+        max_episode_steps=1000,
+        knobs={
+            "bounce": Knob("bounce", ("absolute",), 0.0, 1.0, "0", "restitution of hull and legs"),
+            "friction": Knob("friction", ("absolute",), 0.0, 10.0, "0.1", "friction of the moon"),
+            "engine-power": Knob(
+                "engine_power", ("multiplier",), 0.05, 20.0, "1x", "power of the main engine"
+            ),
+        },
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One intervened environment instance, e.g. ``engine-power=1.25x``; no knob is the default."""
+
+    knob: str | None = None
+    value: Value | None = None
+
+    def __str__(self) -> str:
+        return "default" if self.knob is None else f"{self.knob}={self.value}"
+
+
+def _format(x: float) -> str:
+    """Shortest text that reads back as ``x``; 2.0 is ``2``, and -0.0 is ``0``."""
+    x = x + 0.0
+    return str(int(x)) if x.is_integer() and abs(x) < 1e15 else repr(x)
+
+
+def environment(name: str) -> Environment:
+    """The environment called ``name``.
+
+    Raises:
+        UsageError: no such environment.
+    """
+    if name not in ENVIRONMENTS:
+        raise UsageError(f"unknown environment {name!r}", suggest(name, ENVIRONMENTS))
+    return ENVIRONMENTS[name]
+
+
+def knob_of(env: str, knob: str) -> Knob:
+    """The knob ``knob`` of environment ``env``.
+
+    Raises:
+        UsageError: the environment has no such knob; the hint names one that has.
+    """
+    knobs = environment(env).knobs
+    if knob in knobs:
+        return knobs[knob]
+    others = sorted(e.name for e in ENVIRONMENTS.values() if knob in e.knobs)
+    if others:
+        hint = f"{knob!r} belongs to {', '.join(others)}; {env} has: {', '.join(sorted(knobs))}"
+    else:
+        hint = suggest(knob, knobs)
+    raise UsageError(f"environment {env!r} has no intervention {knob!r}", hint)
+
+
+def parse_value(env: str, knob: str, text: str) -> Value:
+    """One value of a knob, checked against the forms and the range that the knob allows.
+
+    Raises:
+        UsageError: not a number of an allowed form, not finite, or out of range.
+    """
+    spec = knob_of(env, knob)
+    examples = " or ".join(_EXAMPLES[kind] for kind in spec.kinds)
+    for kind, form in _FORMS.items():
+        match = form.fullmatch(text.strip())
+        if match is None:
+            continue
+        if kind not in spec.kinds:
+            raise UsageError(
+                f"{knob}={text.strip()!r}: {env} takes {knob} as {' or '.join(spec.kinds)}, "
+                f"not as {kind}",
+                f"write it like {knob}={examples}",
+            )
+        numbers = tuple(float(group) + 0.0 for group in match.groups())
+        if kind == "range" and numbers[0] > numbers[1]:
+            raise UsageError(
+                f"{knob}={text.strip()!r}: the range is empty",
+                f"write the smaller end first: {_format(numbers[1])}..{_format(numbers[0])}",
+            )
+        for x in numbers:
+            if not math.isfinite(x) or not spec.low <= x <= spec.high:
+                raise UsageError(
+                    f"{knob}={text.strip()!r} is out of range",
+                    f"{knob} ({spec.what}) lies in {_format(spec.low)} to {_format(spec.high)}",
+                )
+        return Value(kind, numbers)
+    raise UsageError(
+        f"{knob}={text.strip()!r} is no intervention value", f"write it like {knob}={examples}"
+    )
+
+
+def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
+    """``"leg-length=1x,2x"`` as one setting per value, in the order written.
+
+    Raises:
+        UsageError: malformed text, unknown knob, bad or repeated value.
+    """
+    knob, equals, values = text.partition("=")
+    knob = knob.strip()
+    if not equals or not knob or not values.strip():
+        names = sorted(environment(env).knobs)
+        raise UsageError(
+            f"{text!r} is no intervention",
+            f"write KNOB=VALUE,VALUE; {env} has: {', '.join(names)}",
+        )
+    knob_of(env, knob)
+    settings = tuple(Setting(knob, parse_value(env, knob, part)) for part in values.split(","))
+    for i, setting in enumerate(settings):
+        if setting in settings[:i]:
+            raise UsageError(
+                f"{text!r} names {setting} twice", "each setting is one dataset group: name it once"
+            )
+    return settings
+
+
+def parse_setting(env: str, text: str) -> Setting:
+    """The setting written as :class:`Setting` prints itself: ``default`` or ``knob=value``.
+
+    Raises:
+        UsageError: as :func:`parse_settings`, or more than one value.
+    """
+    if text == "default":
+        environment(env)
+        return Setting()
+    settings = parse_settings(env, text)
+    if len(settings) != 1:
+        raise UsageError(f"{text!r} names {len(settings)} settings where one is needed", "name one")
+    return settings[0]
+
+
+def env_kwargs(env: str, setting: Setting) -> dict[str, Any]:
+    """The keyword arguments that make ``env`` an instance of ``setting``."""
+    if setting.knob is None or setting.value is None:
+        return {}
+    return {knob_of(env, setting.knob).argument: setting.value.argument}

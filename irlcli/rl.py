@@ -1,0 +1,432 @@
+"""Reinforcement learning: the only module that knows stable-baselines3.
+
+PPO is trained in *rounds*. A round seeds every generator from (seed, round), starts fresh
+episodes, collects one or more rollouts and updates on each. What leaves a round is only the
+network, its optimiser and a step count, so a run continued from any round's checkpoint equals
+an uninterrupted one byte for byte on the same machine.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from irlcli import envs
+from irlcli.envs.vector import Ended, VectorWorlds
+from irlcli.errors import StageFailed
+from irlcli.interventions import Setting, environment
+from irlcli.settings import PPOSettings
+from irlcli.trajectories import Trajectory
+
+_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+
+# Categorical re-checks its support on every one of millions of calls; SB3 builds it from
+# logits that are finite or the run has failed already.
+torch.distributions.Distribution.set_default_validate_args(False)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """T steps of N worlds, time first. ``s`` is ``observations``, ``s'`` ``next_observations``.
+
+    ``next_observations`` holds the true successor also where an episode ended (not the first
+    observation of the next episode). ``log_probs`` are log pi(a|s) of the sampling policy.
+    """
+
+    observations: np.ndarray  # [T, N, D] float32
+    actions: np.ndarray  # [T, N] int64 or [T, N, A] float32
+    next_observations: np.ndarray  # [T, N, D] float32
+    log_probs: np.ndarray  # [T, N] float32
+    true_rewards: np.ndarray  # [T, N] float64
+    terminated: np.ndarray  # [T, N] bool
+    truncated: np.ndarray  # [T, N] bool
+    lengths: np.ndarray  # [T, N] int64: length of the episode that ended here, else 0
+    returns: np.ndarray  # [T, N] float64: its true return
+
+
+RewardFunction = Callable[[Rollout], np.ndarray]
+
+
+class _RecordingVecEnv(VecEnv):
+    """What SB3 steps: our worlds, plus a record of the transitions that its buffer drops."""
+
+    def __init__(self, worlds: VectorWorlds):
+        self.worlds = worlds
+        super().__init__(len(worlds), worlds.observation_space, worlds.action_space)
+        self.seeds: Sequence[int] = range(len(worlds))
+        self.rewards: list[np.ndarray] = []
+        self.ended: list[tuple[int, Ended]] = []
+        self._actions: np.ndarray | None = None
+        self._no_infos: list[dict[str, Any]] = [{} for _ in range(len(worlds))]
+
+    def start_recording(self) -> None:
+        self.rewards, self.ended = [], []
+
+    def reset(self) -> np.ndarray:
+        return self.worlds.reset(self.seeds)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        observations, rewards, ended = self.worlds.step(self._actions)
+        dones = np.zeros(self.num_envs, dtype=bool)
+        infos = self._no_infos
+        if ended:
+            infos = list(self._no_infos)
+            for end in ended:
+                self.ended.append((len(self.rewards), end))
+                dones[end.world] = True
+                infos[end.world] = {
+                    "terminal_observation": end.final_observation,
+                    "TimeLimit.truncated": not end.terminated,
+                }
+        self.rewards.append(rewards)
+        # SB3 adds the bootstrapped value of truncated steps to the array it is handed.
+        return observations, rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        self.worlds.close()
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.worlds.envs[i], attr_name) for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name, value, indices=None):
+        for i in self._get_indices(indices):
+            setattr(self.worlds.envs[i], attr_name, value)
+
+    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
+        return [
+            getattr(self.worlds.envs[i], method_name)(*method_args, **method_kwargs)
+            for i in self._get_indices(indices)
+        ]
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False for _ in self._get_indices(indices)]
+
+
+class PPOTrainer:
+    """SB3's PPO, one seeded round at a time.
+
+    Args:
+        worlds: the environments to learn in.
+        ppo: hyper-parameters.
+        total_steps: environment steps the schedules run over.
+        seed: everything random in round r derives from (seed, r).
+    """
+
+    def __init__(self, worlds: VectorWorlds, ppo: PPOSettings, total_steps: int, seed: int):
+        torch.set_num_threads(1)
+        self.ppo = ppo
+        self.total_steps = total_steps
+        self.seed = seed
+        self._venv = _RecordingVecEnv(worlds)
+        with warnings.catch_warnings():
+            # A buffer that the batch size does not divide gives one short batch, as intended.
+            warnings.filterwarnings("ignore", message=".*mini-batch size.*")
+            self.model = PPO(
+                "MlpPolicy",
+                self._venv,
+                n_steps=ppo.n_steps,
+                batch_size=ppo.batch_size,
+                n_epochs=ppo.n_epochs,
+                learning_rate=_schedule(ppo.learning_rate, ppo.learning_rate_schedule),
+                clip_range=_schedule(ppo.clip_range, ppo.clip_range_schedule),
+                gamma=ppo.gamma,
+                gae_lambda=ppo.gae_lambda,
+                ent_coef=ppo.ent_coef,
+                vf_coef=ppo.vf_coef,
+                max_grad_norm=ppo.max_grad_norm,
+                policy_kwargs=_policy_kwargs(ppo),
+                seed=_derive(seed, -1)[0],
+                device="cpu",
+            )
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
+        # What ``learn`` does before its loop; the rounds here take the place of that loop.
+        _, self._callback = self.model._setup_learn(total_steps)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps taken so far."""
+        return self.model.num_timesteps
+
+    @property
+    def steps_per_round(self) -> int:
+        """Environment steps of one round."""
+        return self.ppo.rollouts_per_round * self.ppo.n_steps * self._venv.num_envs
+
+    @property
+    def rounds(self) -> int:
+        """Rounds that make up at least ``total_steps``."""
+        return -(-self.total_steps // self.steps_per_round)
+
+    @property
+    def policy(self) -> Policy:
+        """The current policy; it keeps learning with the trainer."""
+        return Policy(self.model.policy)
+
+    def train_round(self, index: int, reward: RewardFunction | None = None) -> list[Rollout]:
+        """Run round ``index``; with ``reward``, on its [T, N] rewards instead of the true ones.
+
+        ``reward`` sees one whole rollout at a time. A truncated step is bootstrapped here, on
+        the value of its final observation; a terminated one is not.
+
+        Raises:
+            StageFailed: the policy's parameters stopped being finite.
+        """
+        generator_seed, *world_seeds = _derive(self.seed, index, 1 + self._venv.num_envs)
+        torch.manual_seed(generator_seed)
+        # SB3 shuffles its minibatches by numpy's global generator.
+        np.random.seed(generator_seed % 2**32)
+        self._venv.seeds = world_seeds
+        self.model._last_obs = self._venv.reset()
+        self.model._last_episode_starts = np.ones(self._venv.num_envs, dtype=bool)
+        rollouts = []
+        for _ in range(self.ppo.rollouts_per_round):
+            rollout = self._collect()
+            if reward is not None:
+                self._replace_rewards(rollout, reward(rollout))
+            remaining = max(0.0, 1.0 - self.model.num_timesteps / self.total_steps)
+            self.model._current_progress_remaining = remaining
+            self.model.train()
+            rollouts.append(rollout)
+        if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
+            raise StageFailed(
+                f"the policy's parameters are not finite after round {index}",
+                "a smaller learning rate or gradient norm usually helps",
+            )
+        return rollouts
+
+    def _collect(self) -> Rollout:
+        model, buffer = self.model, self.model.rollout_buffer
+        self._venv.start_recording()
+        model.collect_rollouts(self._venv, self._callback, buffer, model.n_steps)
+        shape = (model.n_steps, self._venv.num_envs)
+        # SB3 flattens the buffer's arrays in place when it trains: these are copies.
+        observations = buffer.observations.copy()
+        next_observations = np.concatenate([observations[1:], model._last_obs[None]])
+        terminated, truncated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        lengths, returns = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+        for t, end in self._venv.ended:
+            next_observations[t, end.world] = end.final_observation
+            terminated[t, end.world] = end.terminated
+            truncated[t, end.world] = not end.terminated
+            lengths[t, end.world] = end.length
+            returns[t, end.world] = end.episode_return
+        actions = buffer.actions.copy()
+        if isinstance(model.action_space, gymnasium.spaces.Discrete):
+            actions = actions[..., 0].astype(np.int64)
+        return Rollout(
+            observations=observations,
+            actions=actions,
+            next_observations=next_observations,
+            log_probs=buffer.log_probs.copy(),
+            true_rewards=np.stack(self._venv.rewards),
+            terminated=terminated,
+            truncated=truncated,
+            lengths=lengths,
+            returns=returns,
+        )
+
+    def _replace_rewards(self, rollout: Rollout, rewards: np.ndarray) -> None:
+        model, buffer = self.model, self.model.rollout_buffer
+        rewards = np.array(rewards, dtype=np.float32)
+        with torch.no_grad():
+            if rollout.truncated.any():
+                final = torch.as_tensor(rollout.next_observations[rollout.truncated])
+                values = model.policy.predict_values(final)[:, 0].numpy()
+                rewards[rollout.truncated] += model.gamma * values
+            last_values = model.policy.predict_values(torch.as_tensor(model._last_obs))
+        buffer.rewards[:] = rewards
+        buffer.compute_returns_and_advantage(last_values, model._last_episode_starts)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a later process needs to go on from the end of the last round (tensors, numbers)."""
+        return {
+            "policy": self.model.policy.state_dict(),
+            "optimizer": self.model.policy.optimizer.state_dict(),
+            "steps": self.model.num_timesteps,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict()`` of an equally configured trainer."""
+        self.model.policy.load_state_dict(state["policy"])
+        self.model.policy.optimizer.load_state_dict(state["optimizer"])
+        self.model.num_timesteps = int(state["steps"])
+
+
+class Policy:
+    """A stochastic policy pi(a|s), as SB3's actor-critic network."""
+
+    def __init__(self, network: ActorCriticPolicy):
+        self.network = network
+
+    def act(self, observations: np.ndarray, deterministic: bool = False) -> np.ndarray:
+        """Actions [N] or [N, A] for observations [N, D]; samples by torch's global generator."""
+        with torch.no_grad():
+            distribution = self.network.get_distribution(torch.as_tensor(observations))
+            return distribution.get_actions(deterministic=deterministic).numpy()
+
+    def log_prob(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """log pi(a|s) [B] for observations [B, D] and actions [B] or [B, A], without gradient."""
+        with torch.no_grad():
+            return self.network.get_distribution(observations).log_prob(actions)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The network's tensors."""
+        return self.network.state_dict()
+
+    @staticmethod
+    def describe(env: str, ppo: PPOSettings) -> dict[str, Any]:
+        """JSON that, with the tensors, is enough to rebuild the policy (``load_policy``)."""
+        return {
+            "algorithm": "ppo",
+            "env": env,
+            "net_arch": list(ppo.net_arch),
+            "activation": ppo.activation,
+            "ortho_init": ppo.ortho_init,
+        }
+
+
+def load_policy(description: dict[str, Any], state: dict[str, torch.Tensor]) -> Policy:
+    """The policy that ``Policy.describe`` and ``Policy.state_dict`` wrote down.
+
+    Raises:
+        KeyError, RuntimeError: the description and the tensors do not fit each other.
+    """
+    torch.set_num_threads(1)
+    world = envs.make(description["env"], Setting())
+    network = ActorCriticPolicy(
+        world.observation_space,
+        world.action_space,
+        lambda _: 0.0,
+        net_arch=list(description["net_arch"]),
+        activation_fn=_ACTIVATIONS[description["activation"]],
+        ortho_init=description["ortho_init"],
+    )
+    world.close()
+    network.load_state_dict(state)
+    network.set_training_mode(False)
+    return Policy(network)
+
+
+def make_worlds(env: str, settings: Sequence[Setting], count: int) -> VectorWorlds:
+    """``count`` worlds in equal shares of each setting, setting-major (world i: i*S//count)."""
+    return VectorWorlds(
+        [envs.make(env, settings[i * len(settings) // count]) for i in range(count)],
+        environment(env).max_episode_steps,
+    )
+
+
+def roll_out(
+    env: str,
+    setting: Setting,
+    policy: Policy | str,
+    episodes: int,
+    seed: int,
+    deterministic: bool = False,
+    parallel: int = 16,
+) -> list[Trajectory]:
+    """``episodes`` whole episodes of ``policy`` (or ``"random"``, ``"idle"``) in one setting.
+
+    Episode k starts from its own seed derived from (seed, k), whatever the others do.
+    """
+    torch.set_num_threads(1)
+    limit = environment(env).max_episode_steps
+    trajectories: list[Trajectory] = []
+    for first in range(0, episodes, parallel):
+        batch = range(first, min(first + parallel, episodes))
+        seeds = [_derive(seed, k)[0] for k in batch]
+        torch.manual_seed(seeds[0])
+        rng = np.random.default_rng(seeds[0])
+        worlds = [envs.make(env, setting) for _ in batch]
+        trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, rng)
+        for world in worlds:
+            world.close()
+    return trajectories
+
+
+def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Trajectory]:
+    observations = [[w.reset(seed=s)[0]] for w, s in zip(worlds, seeds, strict=True)]
+    actions: list[list[Any]] = [[] for _ in worlds]
+    rewards: list[list[float]] = [[] for _ in worlds]
+    ends = [(False, False)] * len(worlds)
+    active = list(range(len(worlds)))
+    space = worlds[0].action_space
+    while active:
+        current = np.stack([observations[i][-1] for i in active])
+        if isinstance(policy, Policy):
+            chosen = policy.act(current, deterministic)
+        elif policy == "random":
+            chosen = _random_actions(space, len(active), rng)
+        else:
+            chosen = _idle_actions(space, len(active))
+        still = []
+        for i, action in zip(active, chosen, strict=True):
+            observation, reward, terminated, truncated, _ = worlds[i].step(action)
+            observations[i].append(np.asarray(observation, dtype=np.float32))
+            actions[i].append(action)
+            rewards[i].append(float(reward))
+            truncated = truncated or len(rewards[i]) >= limit
+            ends[i] = (bool(terminated), bool(truncated and not terminated))
+            if not (terminated or truncated):
+                still.append(i)
+        active = still
+    return [
+        Trajectory(
+            observations=np.stack(observations[i]),
+            actions=np.asarray(actions[i], dtype=_action_dtype(space)),
+            rewards=np.asarray(rewards[i], dtype=np.float64),
+            terminated=ends[i][0],
+            truncated=ends[i][1],
+            seed=seeds[i],
+        )
+        for i in range(len(worlds))
+    ]
+
+
+def _action_dtype(space: gymnasium.Space) -> type:
+    return np.int64 if isinstance(space, gymnasium.spaces.Discrete) else np.float32
+
+
+def _random_actions(space: gymnasium.Space, count: int, rng: np.random.Generator) -> np.ndarray:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return rng.integers(space.n, size=count)
+    return rng.uniform(space.low, space.high, size=(count, *space.shape)).astype(np.float32)
+
+
+def _idle_actions(space: gymnasium.Space, count: int) -> np.ndarray:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return np.zeros(count, dtype=np.int64)
+    return np.zeros((count, *space.shape), dtype=np.float32)
+
+
+def _policy_kwargs(ppo: PPOSettings) -> dict[str, Any]:
+    return {
+        "net_arch": list(ppo.net_arch),
+        "activation_fn": _ACTIVATIONS[ppo.activation],
+        "ortho_init": ppo.ortho_init,
+        # One kernel for all parameters: the optimiser's step is most of a small network's update.
+        "optimizer_kwargs": {"fused": True},
+    }
+
+
+def _schedule(value: float, kind: str) -> float | LinearSchedule:
+    return LinearSchedule(value, 0.0, 1.0) if kind == "linear" else value
+
+
+def _derive(seed: int, index: int, count: int = 1) -> list[int]:
+    """``count`` seeds below 2**31 derived from (seed, index); index -1 is the initialisation."""
+    sequence = np.random.SeedSequence([seed, index + 1])
+    return [int(x) for x in sequence.generate_state(count) % 2**31]

@@ -1,0 +1,115 @@
+"""Trajectories: frozen, validated, plain arrays. Time-indexed as s_0, a_0, r_0, s_1, ..., s_T."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One episode of T >= 1 steps.
+
+    Attributes:
+        observations: [T + 1, D] float32, the final one included.
+        actions: [T] int64 or [T, A] float32, as the policy sampled them.
+        rewards: [T] float64, the true reward.
+        terminated: the environment ended the episode; its value afterwards is zero.
+        truncated: a time limit ended it; its value afterwards is not zero.
+        seed: what the environment was reset with.
+
+    Raises:
+        ValueError: shapes, types or flags that do not fit, or numbers that are not finite.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminated: bool
+    truncated: bool
+    seed: int
+
+    def __post_init__(self) -> None:
+        steps = len(self.rewards)
+        if steps < 1:
+            raise ValueError("a trajectory needs at least one step")
+        if self.observations.ndim != 2 or len(self.observations) != steps + 1:
+            raise ValueError(
+                f"{steps} rewards need observations [{steps + 1}, D], "
+                f"not {list(self.observations.shape)}"
+            )
+        if len(self.actions) != steps or self.actions.ndim not in (1, 2):
+            raise ValueError(
+                f"{steps} rewards need {steps} actions, not {list(self.actions.shape)}"
+            )
+        if self.observations.dtype != np.float32 or self.rewards.dtype != np.float64:
+            raise ValueError("observations are float32 and rewards float64")
+        if self.actions.dtype not in (np.dtype(np.int64), np.dtype(np.float32)):
+            raise ValueError(f"actions are int64 or float32, not {self.actions.dtype}")
+        if self.terminated == self.truncated:
+            raise ValueError("a whole episode is either terminated or truncated")
+        for name in ("observations", "actions", "rewards"):
+            array = getattr(self, name)
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} are not finite")
+            array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def episode_return(self) -> float:
+        """Undiscounted true return."""
+        return float(self.rewards.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """B transitions (s, a, s'), stacked over episodes.
+
+    Attributes:
+        observations: [B, D] float32.
+        actions: [B] int64 or [B, A] float32.
+        next_observations: [B, D] float32.
+        terminated: [B] bool; false where a time limit ended the episode.
+        remaining: [B] int64, steps that were left of the horizon after a terminated step (the
+            number of steps the absorbing state stands for), else 0.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    next_observations: np.ndarray
+    terminated: np.ndarray
+    remaining: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def transitions(trajectories: Sequence[Trajectory], horizon: int) -> Transitions:
+    """All transitions of ``trajectories``; ``horizon`` is the environment's time limit [steps].
+
+    Raises:
+        ValueError: no trajectory, or one longer than the horizon.
+    """
+    if not trajectories:
+        raise ValueError("at least one trajectory is needed")
+    longest = max(len(t) for t in trajectories)
+    if longest > horizon:
+        raise ValueError(f"a trajectory of {longest} steps exceeds the horizon of {horizon}")
+    last = np.concatenate([np.arange(len(t)) == len(t) - 1 for t in trajectories])
+    ends = np.concatenate([np.full(len(t), t.terminated) for t in trajectories]) & last
+    lengths = np.concatenate([np.full(len(t), len(t)) for t in trajectories])
+    return Transitions(
+        observations=np.concatenate([t.observations[:-1] for t in trajectories]),
+        actions=np.concatenate([t.actions for t in trajectories]),
+        next_observations=np.concatenate([t.observations[1:] for t in trajectories]),
+        terminated=ends,
+        remaining=np.where(ends, horizon - lengths, 0).astype(np.int64),
+    )
+
+
+Dataset = Mapping[str, tuple[Trajectory, ...]]
+"""Demonstrations by setting, in the order the settings were named."""
