@@ -1,32 +1,23 @@
 """The command line: parse, call the runner, print. Heavy libraries load only where work is done."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
 from irlcli import console as out
 from irlcli.errors import IntegrityError, Interrupted, IrlError, NotFound, StageFailed, UsageError
 
-app = typer.Typer(
-    name="irl",
-    help="Invariant reward learning: experts, adversarial IRL, transfer, evaluation.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
+_COMMANDS: dict[str, tuple[Callable, bool]] = {}
 
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
 Seed = Annotated[int, typer.Option(min=0, help="Everything random derives from it.")]
-Name = Annotated[Optional[str], typer.Option(help="Name to give the artefact.")]
-Env = Annotated[Optional[str], typer.Option(help="Environment, e.g. lunar-lander.")]
+Name = Annotated[str | None, typer.Option(help="Name to give the artefact.")]
+Env = Annotated[str | None, typer.Option(help="Environment, e.g. lunar-lander.")]
 
 
 class Session:
@@ -35,14 +26,14 @@ class Session:
     def __init__(
         self,
         store: Path,
-        profile: str,
-        settings: Path | None,
-        overrides: Sequence[str],
         as_json: bool,
-        dry_run: bool,
-        wait: bool,
-        quiet: bool,
-        tensorboard: Path | None,
+        profile: str = "standard",
+        settings: Path | None = None,
+        overrides: Sequence[str] = (),
+        dry_run: bool = False,
+        wait: bool = True,
+        quiet: bool = False,
+        tensorboard: Path | None = None,
     ):
         from irlcli.store import Store
 
@@ -108,11 +99,20 @@ def command(name: str, runs: bool = True) -> Callable:
 
     Commands that run stages (``runs``) also take the options that only concern these.
     """
-    kind = inspect.Parameter.KEYWORD_ONLY
 
-    def option(name_: str, default: Any, type_: Any, help_: str, *flags: str, **more: Any):
+    def register(function: Callable) -> Callable:
+        _COMMANDS[name] = (function, runs)
+        return function
+
+    return register
+
+
+def _common_options(runs: bool) -> list[inspect.Parameter]:
+    def option(name: str, default: Any, type_: Any, help_: str, *flags: str, **more: Any):
         annotation = Annotated[type_, typer.Option(*flags, help=help_, **more)]
-        return inspect.Parameter(name_, kind, default=default, annotation=annotation)
+        return inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+        )
 
     common = [
         option("store", Path("runs"), Path, "Artefact store.", "--store", envvar="IRL_STORE"),
@@ -122,34 +122,34 @@ def command(name: str, runs: bool = True) -> Callable:
     if runs:
         common += [
             option("profile", "standard", str, "smoke, standard or paper.", "--profile"),
-            option("settings", None, Optional[Path], "TOML file over the profile.", "--settings"),
+            option("settings", None, Path | None, "TOML file over the profile.", "--settings"),
             option("overrides", [], list[str], "FIELD=VALUE, repeatable.", "--set"),
             option("dry_run", False, bool, "Say what would be done.", "--dry-run"),
             option("wait", True, bool, "Wait for a process making the same.", "--wait/--no-wait"),
             option("quiet", False, bool, "No progress on stderr.", "--quiet"),
-            option("tensorboard", None, Optional[Path], "Mirror metrics here.", "--tensorboard"),
+            option("tensorboard", None, Path | None, "Mirror metrics here.", "--tensorboard"),
         ]
+    return common
 
-    def register(function: Callable) -> Callable:
-        own = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
 
-        def run(**values: Any) -> None:
-            # Read by main() from the arguments: an error may come before they are parsed.
-            del values["debug"]
-            given = {p.name: values.pop(p.name) for p in common if p.name != "debug"}
-            if not runs:
-                given |= {"profile": "standard", "settings": None, "overrides": [], "quiet": False}
-                given |= {"dry_run": False, "wait": True, "tensorboard": None}
-            function(Session(**given), **values)
+def _with_common_options(function: Callable, runs: bool) -> Callable:
+    """``function`` as typer should see it: the session's options in place of the session."""
+    common = _common_options(runs)
+    own = [
+        p.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for p in list(inspect.signature(function).parameters.values())[1:]
+    ]
 
-        arguments = [p.replace(kind=kind) for p in own]
-        run.__signature__ = inspect.Signature([*arguments, *common])
-        run.__annotations__ = {p.name: p.annotation for p in [*arguments, *common]}
-        run.__doc__ = function.__doc__
-        app.command(name)(run)
-        return function
+    def run(**values: Any) -> None:
+        # Read by main() from the arguments: an error may come before they are parsed.
+        del values["debug"]
+        session = Session(**{p.name: values.pop(p.name) for p in common if p.name in values})
+        function(session, **values)
 
-    return register
+    run.__signature__ = inspect.Signature([*own, *common])
+    run.__annotations__ = {p.name: p.annotation for p in [*own, *common]}
+    run.__doc__ = function.__doc__
+    return run
 
 
 @command("collect-experts")
@@ -158,7 +158,7 @@ def collect_experts(
     env: Annotated[str, typer.Option(help="Environment, e.g. lunar-lander.")],
     intervention: Annotated[str, typer.Option(help="KNOB=VALUE,VALUE; one setting per value.")],
     episodes: Annotated[
-        Optional[str], typer.Option(help="Per setting: 10, or 1,3,10 for three settings.")
+        str | None, typer.Option(help="Per setting: 10, or 1,3,10 for three settings.")
     ] = None,
     seed: Seed = 0,
     name: Name = None,
@@ -177,8 +177,8 @@ def collect_experts(
 def train_airl(
     session: Session,
     demos: Annotated[str, typer.Option(help="Demonstrations: an artefact.")],
-    method: Annotated[Optional[str], typer.Option(help="erm, erm-balanced or irm.")] = None,
-    penalty_weight: Annotated[Optional[float], typer.Option(help="lambda of IRM.")] = None,
+    method: Annotated[str | None, typer.Option(help="erm, erm-balanced or irm.")] = None,
+    penalty_weight: Annotated[float | None, typer.Option(help="lambda of IRM.")] = None,
     state_only: Annotated[bool, typer.Option("--state-only", help="g(s), not g(s, a).")] = False,
     seed: Seed = 0,
     name: Name = None,
@@ -224,18 +224,18 @@ def transfer(
 @command("evaluate")
 def evaluate(
     session: Session,
-    policy: Annotated[Optional[str], typer.Option(help="policy.pt or its artefact.")] = None,
+    policy: Annotated[str | None, typer.Option(help="policy.pt or its artefact.")] = None,
     expert: Annotated[bool, typer.Option("--expert", help="The expert of each setting.")] = False,
     random: Annotated[bool, typer.Option("--random", help="Uniformly random actions.")] = False,
     idle: Annotated[bool, typer.Option("--idle", help="Does nothing.")] = False,
     ood: Annotated[
-        Optional[str], typer.Option(help="Settings: VALUE,... of the policy's own knob.")
+        str | None, typer.Option(help="Settings: VALUE,... of the policy's own knob.")
     ] = None,
     intervention: Annotated[
-        Optional[str], typer.Option(help="Settings: KNOB=VALUE,VALUE.")
+        str | None, typer.Option(help="Settings: KNOB=VALUE,VALUE.")
     ] = None,
     env: Env = None,
-    episodes: Annotated[Optional[int], typer.Option(min=1, help="Per setting.")] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Per setting.")] = None,
     seed: Seed = 0,
     name: Name = None,
 ) -> None:
@@ -342,7 +342,7 @@ def _settings_beside(origin: dict[str, Any], text: str) -> Sequence[Any]:
 @command("ls", runs=False)
 def ls(
     session: Session,
-    stage: Annotated[Optional[str], typer.Option(help="Only this stage.")] = None,
+    stage: Annotated[str | None, typer.Option(help="Only this stage.")] = None,
 ) -> None:
     """List the artefacts."""
     names: dict[str, list[str]] = {}
@@ -439,7 +439,7 @@ def _lineage_lines(node: dict[str, Any], indent: str) -> list[str]:
 @command("verify", runs=False)
 def verify(
     session: Session,
-    ref: Annotated[Optional[str], typer.Argument(help="One artefact; all by default.")] = None,
+    ref: Annotated[str | None, typer.Argument(help="One artefact; all by default.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Compare sizes, hash nothing.")] = False,
 ) -> None:
     """Check stored bytes against their digests; damaged artefacts go to quarantine."""
@@ -557,11 +557,33 @@ def _artefact(session: Session, ref: str) -> Any:
     return resolved.artefact
 
 
+def build_app(arguments: Sequence[str]) -> typer.Typer:
+    """The command line; only the command that ``arguments`` begin with, if they name one.
+
+    Typer inspects every option of every command it holds, which takes longer than a hit.
+    """
+    app = typer.Typer(
+        name="irl",
+        help="Invariant reward learning: experts, adversarial IRL, transfer, evaluation.",
+        no_args_is_help=True,
+        add_completion=False,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    # A callback keeps it a group of commands when there is only one.
+    app.callback()(lambda: None)
+    first = arguments[0] if arguments else ""
+    for name, (function, runs) in _COMMANDS.items():
+        if first not in _COMMANDS or name == first:
+            app.command(name)(_with_common_options(function, runs))
+    return app
+
+
 def main() -> None:
     """Entry point: exit codes and one-line errors (design: Command line)."""
     as_json = "--json" in sys.argv
     try:
-        app(standalone_mode=False)
+        build_app(sys.argv[1:])(standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read our output has enough; Python would complain again at shutdown.

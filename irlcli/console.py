@@ -11,10 +11,12 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from irlcli.errors import IrlError, UsageError
-from irlcli.store import Artefact
+
+if TYPE_CHECKING:
+    from irlcli.store import Artefact
 
 JSON_VERSION = 1
 _PLAIN_SECONDS = 10.0

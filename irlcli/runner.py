@@ -3,8 +3,6 @@
 ``Runner(store).run(request)`` is all there is to the Python API; the command line does the same.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import signal
@@ -13,9 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -60,8 +57,7 @@ class Silent:
         pass
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """One line of a plan: what would happen to a request, and why."""
 
     status: Status

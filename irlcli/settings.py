@@ -5,8 +5,6 @@ environment's file, its profile, ``--settings FILE``, then flags and ``--set``. 
 variables never enter: equal settings give equal artefacts wherever they run.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -91,6 +89,9 @@ class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     max_grad_norm: Positive = 1.0
     updates_per_round: Count = 10
     batch_size: Annotated[int, Meta(ge=2, multiple_of=2)] = 256
+    replay_share: Fraction = 0.5
+    replay_per_round: Count = 1000
+    replay_capacity: Count = 50_000
     penalty_weight: NonNegative = 10.0
     penalty_warmup_rounds: NonNegativeCount = 10
     penalty_ramp_rounds: NonNegativeCount = 10
@@ -153,24 +154,34 @@ def load_settings(
     own = _settings_directory() / f"{env}.toml"
     tree = _read_toml(own)
     profiles = tree.pop("profiles", {})
-    # Each file is checked before it is merged, so that an error names the file it is in.
-    _convert(tree, str(own))
-    tree = _merge(tree, profiles.get(profile, {}))
-    _convert(tree, f"{own}, profile {profile}")
+    layers = [(str(own), tree), (f"{own}, profile {profile}", profiles.get(profile, {}))]
     if file is not None:
-        over = _read_toml(file)
-        _convert(over, str(file))
-        tree = _merge(tree, over)
-    for item in overrides:
-        tree = _merge(tree, _override(item))
-    for dotted, value in (flags or {}).items():
-        if value is not None:
-            tree = _merge(tree, _nest(dotted.split("."), value))
-    settings = _convert(tree, "--set or flags" if overrides or flags else str(file or own))
+        layers.append((str(file), _read_toml(file)))
+    layers += [(f"--set {item!r}", _override(item)) for item in overrides]
+    layers += [
+        (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted.split("."), value))
+        for dotted, value in (flags or {}).items()
+        if value is not None
+    ]
+    settings = _stack(layers)
     for knob, values in settings.interventions.items():
         for value in (*values.id, *values.ood):
             parse_settings(env, f"{knob}={value}")
     return settings
+
+
+def _stack(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Settings:
+    """The settings that ``layers`` of (source, values) lead to, later ones winning."""
+    tree: dict[str, Any] = {}
+    for _, values in layers:
+        tree = _merge(tree, values)
+    try:
+        return _convert(tree, "settings")
+    except UsageError:
+        # Alone, the layer at fault fails too, and the error names it.
+        for source, values in layers:
+            _convert(values, source)
+        raise
 
 
 def _settings_directory() -> Path:

@@ -87,6 +87,10 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.actions)
 
+    def take(self, rows: np.ndarray) -> "Transitions":
+        """The transitions at ``rows``."""
+        return Transitions(*(getattr(self, f.name)[rows] for f in fields(self)))
+
 
 def transitions(trajectories: Sequence[Trajectory], horizon: int) -> Transitions:
     """All transitions of ``trajectories``; ``horizon`` is the environment's time limit [steps].

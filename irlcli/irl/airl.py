@@ -105,13 +105,21 @@ class Minibatch:
 
 
 def sample_minibatch(
-    policy: Sequence[Pool], expert: Sequence[Pool], size: int, generator: torch.Generator
+    policy: Sequence[Pool],
+    expert: Sequence[Pool],
+    size: int,
+    generator: torch.Generator,
+    past: Sequence[Pool] = (),
+    past_share: float = 0.0,
 ) -> Minibatch:
-    """``size`` samples of either label for each of the E groups, with replacement."""
+    """``size`` samples of either label for each of the E groups, with replacement.
 
-    def fields(pool: Pool) -> tuple[torch.Tensor, ...]:
-        picks = torch.randint(len(pool.draw), (size,), generator=generator)
-        rows = pool.draw[picks]
+    Of the policy's samples a share of ``past_share`` comes from ``past``, pools of earlier
+    rounds: without them the discriminator forgets what the policy no longer does.
+    """
+
+    def fields(pool: Pool, count: int) -> tuple[torch.Tensor, ...]:
+        rows = pool.draw[torch.randint(len(pool.draw), (count,), generator=generator)]
         return (
             pool.observations[rows],
             pool.actions[rows],
@@ -120,10 +128,15 @@ def sample_minibatch(
             pool.log_probs[rows],
         )
 
-    groups = [
-        [torch.stack(pair) for pair in zip(fields(p), fields(e), strict=True)]
-        for p, e in zip(policy, expert, strict=True)
-    ]
+    old = round(size * past_share) if past else 0
+    groups = []
+    for e in range(len(expert)):
+        generated = fields(policy[e], size - old)
+        if old:
+            both = zip(generated, fields(past[e], old), strict=True)
+            generated = tuple(torch.cat(pair) for pair in both)
+        pairs = zip(generated, fields(expert[e], size), strict=True)
+        groups.append([torch.stack(pair) for pair in pairs])
     return Minibatch(*(torch.stack(column) for column in zip(*groups, strict=True)))
 
 

@@ -5,12 +5,9 @@ modules here are light: planning and cache hits read them, so each imports torch
 pyarrow and the like inside ``run`` only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 
@@ -44,8 +41,7 @@ class Checkpoints(Protocol):
         """
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """What a stage works with: inputs by role (files or directories), and where to write."""
 
     parameters: Any
@@ -55,8 +51,7 @@ class Job:
     console: Console
 
 
-@dataclass(frozen=True)
-class Stage:
+class Stage(NamedTuple):
     """A kind of work. A change that alters results must raise ``version``."""
 
     name: str
@@ -64,8 +59,7 @@ class Stage:
     run: Callable[[Job], None]
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """An input that exists: a file or an artefact's directory, known by its content's sha256.
 
     ``artefact`` is where it lives in the store; None for a foreign path.
@@ -76,16 +70,14 @@ class Source:
     artefact: Artefact | None = None
 
 
-@dataclass(frozen=True)
-class From:
+class From(NamedTuple):
     """An input that another request makes: one of its outputs, or all of them (``None``)."""
 
-    request: Request
+    request: "Request"
     output: str | None = None
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """A stage with its parameters and inputs, all that its key depends on.
 
     ``parameters`` is a msgspec Struct; every field of it is part of the identity. ``label``
@@ -94,5 +86,5 @@ class Request:
 
     stage: Stage
     parameters: msgspec.Struct
-    inputs: Mapping[str, Source | From] = field(default_factory=dict)
-    label: str = ""
+    inputs: Mapping[str, Source | From]
+    label: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ class Adversary:
             fused=True,
         )
         self._scale = 1.0
+        self._past: list[Transitions] = []
         for data in self._expert:
             self.model.normaliser.update(torch.as_tensor(data.observations))
 
@@ -102,7 +104,8 @@ class Adversary:
         )
         policy_pools = [self._pool(d, policy) for d in data]
         expert_pools = [self._pool(d, policy) for d in self._expert]
-        paired = self._grouped(policy_pools, expert_pools)
+        past_pools = [self._pool(d, policy) for d in self._past]
+        groups = self._grouped(policy_pools, expert_pools, past_pools)
         weight = 0.0
         if config.method == "irm":
             weight = airl.penalty_weight_at(
@@ -112,10 +115,12 @@ class Adversary:
                 config.penalty_ramp_rounds,
             )
         # Every method sees as many samples per update.
-        size = config.batch_size * len(expert_pools) // len(paired[0])
+        size = config.batch_size * len(expert_pools) // len(groups[0])
         generator = torch.Generator().manual_seed(self._derived_seed(index + 1))
         for _ in range(config.updates_per_round):
-            batch = airl.sample_minibatch(*paired, size, generator)
+            batch = airl.sample_minibatch(
+                groups[0], groups[1], size, generator, groups[2], config.replay_share
+            )
             losses = self._losses(batch, weight)
             self._optimizer.zero_grad()
             losses.total.backward()
@@ -126,6 +131,7 @@ class Adversary:
                 f"the discriminator's parameters are not finite after round {index}",
                 "a smaller airl.learning_rate or airl.penalty_weight usually helps",
             )
+        self._remember(data, index)
         self._scale = airl.reward_scale(self.model, [*policy_pools, *expert_pools])
         # Per setting whatever the method pools, so that methods can be compared.
         with torch.no_grad():
@@ -149,13 +155,37 @@ class Adversary:
         return airl.make_pool(self.model, data, log_probs, self.config.fixed_horizon)
 
     def _grouped(
-        self, policy: list[airl.Pool], expert: list[airl.Pool]
-    ) -> tuple[list[airl.Pool], list[airl.Pool]]:
+        self, policy: list[airl.Pool], expert: list[airl.Pool], past: list[airl.Pool]
+    ) -> tuple[list[airl.Pool], list[airl.Pool], list[airl.Pool]]:
+        """Policy, expert and past pools of each group that has a loss of its own."""
+
+        def pooled(pools: list[airl.Pool], copies: int) -> list[airl.Pool]:
+            return [airl.join_pools(pools)] * copies if pools else []
+
         if self.config.method == "erm":
-            return [airl.join_pools(policy)], [airl.join_pools(expert)]
+            return pooled(policy, 1), pooled(expert, 1), pooled(past, 1)
         if self.config.pairing == "pooled":
-            return [airl.join_pools(policy)] * len(expert), expert
-        return policy, expert
+            return pooled(policy, len(expert)), expert, pooled(past, len(expert))
+        return policy, expert, past
+
+    def _remember(self, data: Sequence[Transitions], index: int) -> None:
+        """Keep a uniform sample of this round; thin the past where it outgrows its capacity."""
+        rng = np.random.default_rng(np.random.SeedSequence([self._seed, index, 2]))
+        config = self.config
+        if config.replay_share == 0.0:
+            return
+        kept = [
+            d.take(rng.choice(len(d), min(config.replay_per_round, len(d)), replace=False))
+            for d in data
+        ]
+        if self._past:
+            kept = [join(pair) for pair in zip(self._past, kept, strict=True)]
+        self._past = [
+            d
+            if len(d) <= config.replay_capacity
+            else d.take(np.sort(rng.choice(len(d), config.replay_capacity, replace=False)))
+            for d in kept
+        ]
 
     def _losses(self, batch: airl.Minibatch, weight: float) -> airl.Losses:
         logit, f = airl.logits(self.model, batch)
@@ -168,6 +198,10 @@ class Adversary:
             "model": self.model.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "scale": self._scale,
+            "past": [
+                {f.name: torch.as_tensor(getattr(d, f.name)) for f in fields(Transitions)}
+                for d in self._past
+            ],
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -175,6 +209,10 @@ class Adversary:
         self.model.load_state_dict(state["model"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._scale = state["scale"]
+        self._past = [
+            Transitions(**{name: tensor.numpy() for name, tensor in d.items()})
+            for d in state["past"]
+        ]
 
     def write_reward(self, directory: Path, origin: Mapping[str, Any]) -> None:
         """Write ``reward.pt`` and, for readers without torch, ``reward.json``."""

@@ -1,7 +1,5 @@
 """Demonstrations of each setting's own expert, as one Parquet dataset."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

@@ -1,7 +1,5 @@
 """True return of a policy over whole episodes, in one or more settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

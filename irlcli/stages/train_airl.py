@@ -1,7 +1,5 @@
 """Adversarial IRL from demonstrations: ERM, ERM-balanced or IRM (paper Algorithm 1)."""
 
-from __future__ import annotations
-
 import msgspec
 
 from irlcli.errors import UsageError

@@ -1,7 +1,5 @@
 """Expert of one setting: PPO on the true reward. Trained once, shared by every dataset."""
 
-from __future__ import annotations
-
 import msgspec
 
 from irlcli.interventions import Setting
@@ -28,7 +26,7 @@ def request(env: str, setting: Setting, seed: int, expert: ExpertSettings) -> Re
         total_steps=expert.total_steps,
         ppo=expert.ppo,
     )
-    return Request(STAGE, parameters, label=f"train-expert {env} {setting} seed {seed}")
+    return Request(STAGE, parameters, {}, f"train-expert {env} {setting} seed {seed}")
 
 
 def run(job: Job) -> None:

@@ -1,7 +1,5 @@
 """A new policy, from random initialisation, on a frozen reward in an unseen setting (Sec. 5.3)."""
 
-from __future__ import annotations
-
 import msgspec
 
 from irlcli.interventions import Setting, parse_setting

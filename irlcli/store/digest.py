@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +25,18 @@ def canonical_json(value: Any) -> bytes:
 
 
 def _check(value: Any, where: str) -> None:
-    if value is None or isinstance(value, (bool, int, str)):
+    kind = type(value)
+    if value is None or kind in (bool, int, str):
         return
-    if isinstance(value, float):
+    if kind is float:
         if not math.isfinite(value):
             raise ValueError(f"{where} is {value}, which cannot be part of a key")
-    elif isinstance(value, (list, tuple)):
+    elif kind in (list, tuple):
         for i, item in enumerate(value):
             _check(item, f"{where}[{i}]")
-    elif isinstance(value, Mapping):
+    elif kind is dict:
         for key, item in value.items():
-            if not isinstance(key, str):
+            if type(key) is not str:
                 raise TypeError(f"{where} has the key {key!r}, which is no string")
             _check(item, f"{where}.{key}")
     else:

@@ -5,15 +5,12 @@ artefact's id is their digest. ``provenance.json`` holds what may differ between
 (command line, versions, timings); it carries its own checksum and the id it belongs to.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import stat
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError
 from irlcli.store.digest import canonical_json, digest, file_digest
@@ -21,13 +18,12 @@ from irlcli.store.digest import canonical_json, digest, file_digest
 SCHEMA = 1
 MANIFEST = "manifest.json"
 PROVENANCE = "provenance.json"
-_SHA = re.compile(r"[0-9a-f]{64}")
+_SHA = r"[0-9a-f]{64}"
 # Far above any real one; a larger file is an attack or an accident, and is not parsed.
 _MAX_JSON_BYTES = 16 << 20
 
 
-@dataclass(frozen=True)
-class KeyRecord:
+class KeyRecord(NamedTuple):
     """Everything that determines a result. ``inputs`` maps a role to the content's sha256."""
 
     stage: str
@@ -50,8 +46,7 @@ class KeyRecord:
         }
 
 
-@dataclass(frozen=True)
-class Output:
+class Output(NamedTuple):
     """One file of an artefact: path inside it (POSIX), size in bytes, sha256."""
 
     path: str
@@ -59,8 +54,7 @@ class Output:
     sha256: str
 
 
-@dataclass(frozen=True)
-class Manifest:
+class Manifest(NamedTuple):
     """A key record and the outputs it led to."""
 
     record: KeyRecord
@@ -160,7 +154,7 @@ def _parse_manifest(value: Any) -> Manifest:
     if not isinstance(value["parameters"], dict) or not isinstance(value["inputs"], dict):
         raise ValueError("parameters or inputs is no object")
     for role, sha in value["inputs"].items():
-        if not isinstance(sha, str) or not _SHA.fullmatch(sha):
+        if not isinstance(sha, str) or not re.fullmatch(_SHA, sha):
             raise ValueError(f"input {role!r} is no sha256")
     outputs = []
     for item in value["outputs"]:
@@ -168,7 +162,7 @@ def _parse_manifest(value: Any) -> Manifest:
             raise ValueError("an output has other keys than path, size, sha256")
         if type(item["size"]) is not int or item["size"] < 0:
             raise ValueError(f"output {item['path']!r} has no size")
-        if not isinstance(item["sha256"], str) or not _SHA.fullmatch(item["sha256"]):
+        if not isinstance(item["sha256"], str) or not re.fullmatch(_SHA, item["sha256"]):
             raise ValueError(f"output {item['path']!r} has no sha256")
         outputs.append(Output(check_output_path(item["path"]), item["size"], item["sha256"]))
     if len({o.path for o in outputs}) != len(outputs):

@@ -14,8 +14,6 @@ appears by one rename. The first result of a key wins; a second, different one i
 Reading checks before it trusts: what does not match is moved to quarantine, never deleted.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re
@@ -25,9 +23,8 @@ import time
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError, NotFound, UsageError, suggest
 from irlcli.store.digest import file_digest
@@ -48,14 +45,13 @@ from irlcli.store.scratch import Scratch, fsync_directory, write_durably
 
 FORMAT = 1
 _ID_DIGITS = 16
-_ID = re.compile(rf"[0-9a-f]{{{_ID_DIGITS}}}")
-_KEY = re.compile(r"[0-9a-f]{64}")
-_PREFIX = re.compile(r"[0-9a-f]{3,64}")
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,99}")
+_ID = rf"[0-9a-f]{{{_ID_DIGITS}}}"
+_KEY = r"[0-9a-f]{64}"
+_PREFIX = r"[0-9a-f]{3,64}"
+_NAME = r"[A-Za-z][A-Za-z0-9._-]{0,99}"
 
 
-@dataclass(frozen=True)
-class Artefact:
+class Artefact(NamedTuple):
     """A published artefact: its directory and its manifest."""
 
     directory: Path
@@ -87,24 +83,21 @@ class Artefact:
         return read_provenance(self.directory, self.manifest.id)
 
 
-@dataclass(frozen=True)
-class Published:
+class Published(NamedTuple):
     """What publishing led to; ``diverged`` is the artefact that holds the key if not this one."""
 
     artefact: Artefact
     diverged: Artefact | None = None
 
 
-@dataclass(frozen=True)
-class Damage:
+class Damage(NamedTuple):
     """What is wrong with an artefact, and the command that made it if it still says so."""
 
     problems: list[str]
     command: str
 
 
-@dataclass(frozen=True)
-class Resolved:
+class Resolved(NamedTuple):
     """What a reference names: an artefact and perhaps one of its outputs, or a foreign path."""
 
     artefact: Artefact | None
@@ -194,7 +187,7 @@ class Store:
             return None
         except (UnicodeDecodeError, OSError):
             name = ""
-        if not _ID.fullmatch(name) or not (self.root / name).is_dir():
+        if not re.fullmatch(_ID, name) or not (self.root / name).is_dir():
             # The artefact was removed, or the pointer damaged: computing again repairs both.
             return None
         artefact = self.get(name)
@@ -239,7 +232,7 @@ class Store:
     def ids(self) -> list[str]:
         """The ids of all artefacts, sorted."""
         try:
-            return sorted(entry.name for entry in os.scandir(self.root) if _ID.fullmatch(entry.name))
+            return sorted(entry.name for entry in os.scandir(self.root) if re.fullmatch(_ID, entry.name))
         except FileNotFoundError:
             return []
 
@@ -251,11 +244,11 @@ class Store:
     def names(self) -> dict[str, str]:
         """Name to id, sorted by name."""
         try:
-            entries = sorted(p for p in self._names().iterdir() if _NAME.fullmatch(p.name))
+            entries = sorted(p for p in self._names().iterdir() if re.fullmatch(_NAME, p.name))
         except FileNotFoundError:
             return {}
         found = {entry.name: entry.read_text("utf-8", "replace").strip() for entry in entries}
-        return {name: id16 for name, id16 in found.items() if _ID.fullmatch(id16)}
+        return {name: id16 for name, id16 in found.items() if re.fullmatch(_ID, id16)}
 
     # References
 
@@ -289,7 +282,7 @@ class Store:
         return Resolved(artefact, artefact.directory / rest)
 
     def _by_name(self, name: str) -> Artefact | None:
-        if not _NAME.fullmatch(name):
+        if not re.fullmatch(_NAME, name):
             return None
         id16 = self.names().get(name)
         if id16 is None:
@@ -301,7 +294,7 @@ class Store:
         return self.get(id16)
 
     def _by_prefix(self, prefix: str) -> Artefact | None:
-        if not _PREFIX.fullmatch(prefix):
+        if not re.fullmatch(_PREFIX, prefix):
             return None
         short = prefix[:_ID_DIGITS]
         matches = [name for name in self.ids() if name.startswith(short)]
@@ -321,7 +314,7 @@ class Store:
         Raises:
             UsageError: not a name (letters, digits, ``._-``; an id prefix is none).
         """
-        if not _NAME.fullmatch(name) or _PREFIX.fullmatch(name):
+        if not re.fullmatch(_NAME, name) or re.fullmatch(_PREFIX, name):
             raise UsageError(
                 f"{name!r} cannot be a name",
                 "a letter, then letters, digits, '.', '_', '-'; not hexadecimal digits alone, "
@@ -574,7 +567,7 @@ def _pointers_to(keys: Path, id16: str) -> list[Path]:
     return [
         path
         for path in keys.iterdir()
-        if _KEY.fullmatch(path.name) and path.read_bytes().strip() == id16.encode()
+        if re.fullmatch(_KEY, path.name) and path.read_bytes().strip() == id16.encode()
     ]
 
 
