@@ -156,7 +156,9 @@ def _with_common_options(function: Callable, runs: bool) -> Callable:
 def collect_experts(
     session: Session,
     env: Annotated[str, typer.Option(help="Environment, e.g. lunar-lander.")],
-    intervention: Annotated[str, typer.Option(help="KNOB=VALUE,VALUE; one setting per value.")],
+    intervention: Annotated[
+        str, typer.Option(help="KNOB=VALUE,VALUE; KNOB alone takes its ID values from settings/.")
+    ],
     episodes: Annotated[
         str | None, typer.Option(help="Per setting: 10, or 1,3,10 for three settings.")
     ] = None,
@@ -164,12 +166,11 @@ def collect_experts(
     name: Name = None,
 ) -> None:
     """Train an expert in each setting and record its demonstrations."""
-    from irlcli.interventions import parse_settings
     from irlcli.stages import collect_experts
 
-    settings = parse_settings(env, intervention)
-    counts = None if episodes is None else _counts(episodes)
     config = session.settings(env)
+    settings = _settings(env, config, intervention, "id")
+    counts = None if episodes is None else _counts(episodes)
     session.deliver([collect_experts.request(env, settings, config, seed, counts)], name)
 
 
@@ -202,7 +203,9 @@ def train_airl(
 def transfer(
     session: Session,
     reward: Annotated[str, typer.Option(help="A learned reward: reward.pt or its artefact.")],
-    ood: Annotated[str, typer.Option(help="Setting to transfer to: VALUE or KNOB=VALUE.")],
+    ood: Annotated[
+        str, typer.Option(help="Setting: VALUE, KNOB=VALUE, or KNOB for its OOD value.")
+    ],
     env: Env = None,
     seed: Seed = 0,
     name: Name = None,
@@ -213,10 +216,11 @@ def transfer(
 
     source, origin = tensor_file(session.store, reward, "reward")
     _same_env(reward, origin["env"], env)
-    settings = _settings_beside(origin, ood)
-    if len(settings) != 1:
-        raise UsageError(f"--ood {ood!r} names {len(settings)} settings", "transfer to one")
     config = session.settings(origin["env"])
+    settings = _settings(origin["env"], config, ood, "ood", origin)
+    if len(settings) != 1:
+        names = ", ".join(str(s) for s in settings)
+        raise UsageError(f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one")
     request = transfer.request(source, origin["env"], settings[0], config.transfer, seed)
     session.deliver([request], name)
 
@@ -229,10 +233,11 @@ def evaluate(
     random: Annotated[bool, typer.Option("--random", help="Uniformly random actions.")] = False,
     idle: Annotated[bool, typer.Option("--idle", help="Does nothing.")] = False,
     ood: Annotated[
-        str | None, typer.Option(help="Settings: VALUE,... of the policy's own knob.")
+        str | None,
+        typer.Option(help="VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB (OOD values)."),
     ] = None,
     intervention: Annotated[
-        str | None, typer.Option(help="Settings: KNOB=VALUE,VALUE.")
+        str | None, typer.Option(help="KNOB=VALUE,..., or KNOB (ID values).")
     ] = None,
     env: Env = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Per setting.")] = None,
@@ -252,7 +257,7 @@ def evaluate(
         artefacts = _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name)
     else:
         agent = "expert" if expert else "random" if random else "idle"
-        artefacts = _evaluate_agent(session, agent, ood or intervention, env, episodes, seed, name)
+        artefacts = _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name)
     if artefacts and not session.as_json:
         _print_returns(session, [a.id for a in artefacts], stderr=True)
 
@@ -264,26 +269,25 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
 
     source, origin = tensor_file(session.store, policy, "policy")
     _same_env(policy, origin["env"], env)
-    text = ood or intervention
-    if text is not None:
-        settings = _settings_beside(origin, text)
+    config = session.settings(origin["env"], {"evaluation.episodes": episodes})
+    if ood is not None or intervention is not None:
+        kind = "id" if ood is None else "ood"
+        settings = _settings(origin["env"], config, ood or intervention, kind, origin)
     else:
         settings = [parse_setting(origin["env"], s) for s in origin["settings"]]
-    config = session.settings(origin["env"], {"evaluation.episodes": episodes})
     request = evaluate.request(origin["env"], settings, config.evaluation, source, seed=seed)
     return session.deliver([request], name)
 
 
-def _evaluate_agent(session, agent, text, env, episodes, seed, name):
-    from irlcli.interventions import parse_settings
+def _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name):
     from irlcli.stages import From, evaluate, train_expert
 
-    if env is None or text is None:
+    if env is None or (ood is None and intervention is None):
         raise UsageError(
             f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"
         )
-    settings = parse_settings(env, text)
     config = session.settings(env, {"evaluation.episodes": episodes})
+    settings = _settings(env, config, ood or intervention, "id" if ood is None else "ood")
     if agent != "expert":
         request = evaluate.request(env, settings, config.evaluation, agent=agent, seed=seed)
         return session.deliver([request], name)
@@ -325,18 +329,28 @@ def _same_env(ref: str, learned: str, wanted: str | None) -> None:
         )
 
 
-def _settings_beside(origin: dict[str, Any], text: str) -> Sequence[Any]:
-    """Settings written as ``3x,4x`` (of the knob trained on) or as ``knob=3x,4x``."""
-    from irlcli.interventions import parse_settings
+def _settings(
+    env: str, config: Any, text: str, kind: str, origin: dict[str, Any] | None = None
+) -> Sequence[Any]:
+    """The settings that ``text`` names.
+
+    ``knob=3x,4x``; a knob alone stands for the values listed for it (``kind`` id or ood) in the
+    settings file; ``3x,4x`` alone belongs to the knob that ``origin`` was trained with.
+    """
+    from irlcli.interventions import environment, knob_of, parse_settings
 
     if "=" in text:
-        return parse_settings(origin["env"], text)
+        return parse_settings(env, text)
+    if text in config.interventions:
+        values = getattr(config.interventions[text], kind)
+        return parse_settings(env, f"{text}={','.join(values)}")
+    if origin is None or text in environment(env).knobs or text[:1].isalpha():
+        knob_of(env, text)
+        raise UsageError(f"{text!r} names no value", f"write {text}=VALUE,VALUE")
     knob, equals, _ = origin["settings"][0].partition("=")
     if not equals:
-        raise UsageError(
-            f"{text!r} names no knob and the training settings had none", "write KNOB=VALUE"
-        )
-    return parse_settings(origin["env"], f"{knob}={text}")
+        raise UsageError(f"{text!r} names no knob", "write KNOB=VALUE")
+    return parse_settings(env, f"{knob}={text}")
 
 
 @command("ls", runs=False)

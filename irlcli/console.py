@@ -34,7 +34,7 @@ class TerminalConsole:
         self._first_done: int | None = None
         self._tensorboard = tensorboard
         self._writer = None
-        self._rich = sys.stderr.isatty() and not quiet
+        self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
 
     def start(self, label: str, resumed: bool) -> None:
         """A stage begins; ``resumed`` if from a checkpoint."""

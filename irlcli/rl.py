@@ -203,12 +203,12 @@ class PPOTrainer:
                 # SB3 schedules the learning rate and the clip range only.
                 self.model.ent_coef = self.ppo.ent_coef * remaining
             self.model.train()
+            if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
+                raise StageFailed(
+                    f"the policy's parameters are not finite after an update in round {index}",
+                    "a smaller learning rate or gradient norm usually helps",
+                )
             rollouts.append(rollout)
-        if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
-            raise StageFailed(
-                f"the policy's parameters are not finite after round {index}",
-                "a smaller learning rate or gradient norm usually helps",
-            )
         return rollouts
 
     def _collect(self) -> Rollout:

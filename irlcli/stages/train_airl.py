@@ -35,10 +35,10 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     demos = read_demonstrations(job.inputs["demonstrations"])
     settings = list(demos.trajectories)
-    if p.airl.ppo.n_envs < len(settings):
+    if p.airl.ppo.n_envs % len(settings):
         raise UsageError(
-            f"{p.airl.ppo.n_envs} worlds cannot hold {len(settings)} settings",
-            f"--set airl.ppo.n_envs={len(settings)} or more",
+            f"{p.airl.ppo.n_envs} worlds cannot be shared equally by {len(settings)} settings",
+            f"--set airl.ppo.n_envs to a multiple of {len(settings)}",
         )
     worlds = rl.make_worlds(
         demos.env, [parse_setting(demos.env, s) for s in settings], p.airl.ppo.n_envs

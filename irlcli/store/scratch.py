@@ -40,13 +40,14 @@ def write_durably(path: Path, data: bytes) -> None:
 
 
 class Scratch:
-    """The working directory of one key: a checkpoint, and output directories per attempt."""
+    """The working directory of one key, made on first use: a checkpoint, outputs per attempt."""
 
     def __init__(self, directory: Path):
         self.directory = directory
 
     def save(self, data: bytes) -> None:
         """Replace the checkpoint by ``data``."""
+        self.directory.mkdir(exist_ok=True)
         write_durably(self.directory / CHECKPOINT, hashlib.sha256(data).digest() + data)
 
     def load(self) -> bytes | None:
@@ -69,6 +70,7 @@ class Scratch:
 
     def new_output(self) -> Path:
         """An empty directory for one attempt's outputs; those of dead attempts are removed."""
+        self.directory.mkdir(exist_ok=True)
         for stale in self.directory.glob("out.*"):
             shutil.rmtree(stale)
         path = self.directory / f"out.{uuid.uuid4().hex}"

@@ -343,9 +343,7 @@ class Store:
             Busy: another process holds it and ``wait`` is false.
         """
         with locked(self._locks() / key, wait=wait, on_wait=on_wait):
-            directory = self._work() / key
-            directory.mkdir(exist_ok=True)
-            yield Scratch(directory)
+            yield Scratch(self._work() / key)
 
     def has_checkpoint(self, key: str) -> bool:
         """Whether an interrupted run of ``key`` left something to go on from."""
