@@ -41,7 +41,9 @@ def from_bytes(data: bytes) -> Any:
 def save(path: Path, kind: str, description: dict[str, Any], state: dict[str, Any]) -> None:
     """Write a tensor file of ``kind`` (``reward`` or ``policy``) that describes itself."""
     text = json.dumps(description, sort_keys=True, allow_nan=False)
-    path.write_bytes(to_bytes({"kind": kind, "schema": SCHEMA, "description": text, "state": state}))
+    path.write_bytes(
+        to_bytes({"kind": kind, "schema": SCHEMA, "description": text, "state": state})
+    )
 
 
 def load(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -53,7 +55,9 @@ def load(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     value = _read(path)
     if not isinstance(value, dict) or not {"kind", "schema", "description", "state"} <= set(value):
-        raise IntegrityError(f"{path} is no file of irlcli", f"a {kind} comes from a training stage")
+        raise IntegrityError(
+            f"{path} is no file of irlcli", f"a {kind} comes from a training stage"
+        )
     if value["kind"] != kind:
         raise UsageError(f"{path} is a {value['kind']}, not a {kind}", f"name a {kind} file")
     if not isinstance(value["schema"], int) or value["schema"] > SCHEMA:

@@ -185,6 +185,7 @@ def train_airl(
     name: Name = None,
 ) -> None:
     """Learn a reward and a student policy from demonstrations."""
+    from irlcli.interventions import parse_setting
     from irlcli.references import demonstrations
     from irlcli.stages import train_airl
 
@@ -195,8 +196,8 @@ def train_airl(
         "airl.state_only": state_only or None,
     }
     config = session.settings(env, flags)
-    label = f"train-airl {config.airl.method} {env} {', '.join(settings)} seed {seed}"
-    session.deliver([train_airl.request(source, config.airl, seed, label)], name)
+    parsed = [parse_setting(env, text) for text in settings]
+    session.deliver([train_airl.request(source, env, parsed, config.airl, seed)], name)
 
 
 @command("transfer")
@@ -220,7 +221,9 @@ def transfer(
     settings = _settings(origin["env"], config, ood, "ood", origin)
     if len(settings) != 1:
         names = ", ".join(str(s) for s in settings)
-        raise UsageError(f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one")
+        raise UsageError(
+            f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one"
+        )
     request = transfer.request(source, origin["env"], settings[0], config.transfer, seed)
     session.deliver([request], name)
 

@@ -43,8 +43,6 @@ class TerminalConsole:
         self._printed = self._started - _PLAIN_SECONDS
         self._close_live()
         self._say(f"{'RESUME' if resumed else 'RUN'} {label}")
-        if self._tensorboard is not None:
-            self._writer = _summary_writer(self._tensorboard / label.replace(" ", "_"))
 
     def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
         """How far the present stage is."""
@@ -65,9 +63,13 @@ class TerminalConsole:
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Mirror metrics to TensorBoard, if asked."""
-        if self._writer is not None:
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, step)
+        if self._tensorboard is None:
+            return
+        if self._writer is None:
+            directory = self._label.replace(" ", "_").replace(",", "")
+            self._writer = _summary_writer(self._tensorboard / directory)
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
 
     def warn(self, message: str) -> None:
         """Say it whatever else is shown."""
@@ -96,17 +98,21 @@ class TerminalConsole:
     def _draw(self, done: int, total: int, detail: str) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+        from rich.table import Column
 
         if self._live is None:
             self._live = Progress(
-                TextColumn("{task.fields[label]}"),
-                BarColumn(bar_width=20),
+                BarColumn(bar_width=12),
                 TaskProgressColumn(),
-                TextColumn("{task.fields[detail]}"),
+                TextColumn(
+                    "{task.fields[detail]}",
+                    markup=False,
+                    table_column=Column(no_wrap=True, overflow="ellipsis"),
+                ),
                 console=Console(stderr=True),
                 transient=True,
             )
-            self._task = self._live.add_task("", total=total, label=self._label, detail=detail)
+            self._task = self._live.add_task("", total=total, detail=detail)
             self._live.start()
         self._live.update(self._task, completed=done, total=total, detail=detail)
 

@@ -150,7 +150,9 @@ def read_metadata(directory: Path) -> dict[str, Any]:
         if type(version) is not int or not isinstance(env, str):
             raise ValueError("its metadata is malformed")
     except FileNotFoundError:
-        raise IntegrityError(f"{directory} holds no demonstrations: {EPISODES} is missing") from None
+        raise IntegrityError(
+            f"{directory} holds no demonstrations: {EPISODES} is missing"
+        ) from None
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError) as error:
         raise IntegrityError(
             f"{path} is not a demonstrations file ({_first_line(error)})",

@@ -35,8 +35,8 @@ _LIBRARIES = ("torch", "numpy", "stable-baselines3", "gymnasium", "Box2D", "pyar
 Status = Literal["HIT", "RUN", "RESUME", "BLOCKED"]
 
 
-class Silent:
-    """A console that shows nothing, for use from Python."""
+class Silent(Console):
+    """A console that shows nothing, for use from Python; any other has the same methods."""
 
     def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
         pass
@@ -158,9 +158,7 @@ class Runner:
         parameters = msgspec.to_builtins(request.parameters)
         return KeyRecord(request.stage.name, request.stage.version, parameters, dict(inputs))
 
-    def _make(
-        self, request: Request, record: KeyRecord, sources: Mapping[str, Source]
-    ) -> Artefact:
+    def _make(self, request: Request, record: KeyRecord, sources: Mapping[str, Source]) -> Artefact:
         self.store.create()
 
         def on_wait(holder: str) -> None:

@@ -194,7 +194,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise UsageError(f"{path} is not valid TOML: {error}", "see settings/ for examples") from None
+        raise UsageError(
+            f"{path} is not valid TOML: {error}", "see settings/ for examples"
+        ) from None
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read: {error.strerror}", "name a TOML file with --settings"
@@ -250,7 +252,9 @@ def _override(item: str) -> dict[str, Any]:
             raise UsageError(f"--set {item!r}: {'.'.join(path[:i])} has no fields")
         fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
         if name not in fields:
-            raise UsageError(f"--set {item!r}: no setting {dotted.strip()!r}", suggest(name, fields))
+            raise UsageError(
+                f"--set {item!r}: no setting {dotted.strip()!r}", suggest(name, fields)
+            )
         kind = fields[name]
         if kind == dict[str, InterventionSettings]:
             raise UsageError(

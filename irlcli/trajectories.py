@@ -87,7 +87,7 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.actions)
 
-    def take(self, rows: np.ndarray) -> "Transitions":
+    def take(self, rows: np.ndarray) -> Transitions:
         """The transitions at ``rows``."""
         return Transitions(*(getattr(self, f.name)[rows] for f in fields(self)))
 

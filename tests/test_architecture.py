@@ -9,8 +9,20 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "irlcli"
 HEAVY = {"torch", "stable_baselines3", "gymnasium", "pybullet", "pandas", "pyarrow", "Box2D"}
-OURS = {"store", "stages", "irl", "envs", "rl", "cli", "console", "runner", "references", "dataset",
-        "checkpoints", "report"}
+OURS = {
+    "store",
+    "stages",
+    "irl",
+    "envs",
+    "rl",
+    "cli",
+    "console",
+    "runner",
+    "references",
+    "dataset",
+    "checkpoints",
+    "report",
+}
 
 # Module or package -> what it may never import, at any depth of its own code.
 NEVER = {
@@ -29,9 +41,23 @@ NEVER = {
     "runner": {"cli", "console"} | HEAVY,
 }
 # Modules that planning and hits load: nothing heavy at their top level.
-LIGHT = ["cli", "__main__", "console", "errors", "settings", "interventions", "runner",
-         "references", "report/returns", "stages/__init__", "stages/train_expert",
-         "stages/collect_experts", "stages/train_airl", "stages/transfer", "stages/evaluate"]
+LIGHT = [
+    "cli",
+    "__main__",
+    "console",
+    "errors",
+    "settings",
+    "interventions",
+    "runner",
+    "references",
+    "report/returns",
+    "stages/__init__",
+    "stages/train_expert",
+    "stages/collect_experts",
+    "stages/train_airl",
+    "stages/transfer",
+    "stages/evaluate",
+]
 
 
 def imported(path, top_level_only=False):

@@ -22,12 +22,11 @@ from irlcli.stages import From, collect_experts, train_airl, transfer
 
 def request(stage):
     config = load_settings("lunar-lander", "smoke")
-    demos = collect_experts.request(
-        "lunar-lander", parse_settings("lunar-lander", "engine-power=1x,1.25x"), config
-    )
+    settings = parse_settings("lunar-lander", "engine-power=1x,1.25x")
+    demos = collect_experts.request("lunar-lander", settings, config)
     if stage == "collect-experts":
         return demos
-    reward = train_airl.request(From(demos), config.airl, seed=3)
+    reward = train_airl.request(From(demos), "lunar-lander", settings, config.airl, seed=3)
     if stage == "train-airl":
         return reward
     setting = parse_setting("lunar-lander", "engine-power=1.5x")
@@ -35,10 +34,13 @@ def request(stage):
         From(reward, "reward.pt"), "lunar-lander", setting, config.transfer, seed=3
     )
 """
-RUN = CHAIN + """
+RUN = (
+    CHAIN
+    + """
 runner = Runner(sys.argv[1], command=["irl", "test"], checkpoint_seconds=0.0)
 print(runner.run(request(sys.argv[2])).manifest.id)
 """
+)
 
 
 def start(store, stage):

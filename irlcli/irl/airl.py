@@ -67,9 +67,7 @@ def make_pool(
         terminated = torch.zeros(len(observations))
         absorbed = len(data) + np.arange(len(ends))
         draw = np.concatenate([draw, np.repeat(absorbed, data.remaining[ends])])
-    return Pool(
-        observations, actions, successors, terminated, log_probs, torch.as_tensor(draw)
-    )
+    return Pool(observations, actions, successors, terminated, log_probs, torch.as_tensor(draw))
 
 
 def join_pools(pools: Sequence[Pool]) -> Pool:
@@ -87,9 +85,7 @@ def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
     trained on them; nothing is centred, as that would change what the reward asks for.
     """
     with torch.no_grad():
-        g = torch.cat(
-            [model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools]
-        )
+        g = torch.cat([model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools])
     return max(float(g.double().std()), 1e-6)
 
 

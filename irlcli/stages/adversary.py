@@ -217,15 +217,11 @@ class Adversary:
     def write_reward(self, directory: Path, origin: Mapping[str, Any]) -> None:
         """Write ``reward.pt`` and, for readers without torch, ``reward.json``."""
         description = {**origin, "network": self._network, "scale": self._scale}
-        checkpoints.save(
-            directory / "reward.pt", "reward", description, self.model.state_dict()
-        )
+        checkpoints.save(directory / "reward.pt", "reward", description, self.model.state_dict())
         write_json(directory / "reward.json", description)
 
 
-def rollout_transitions(
-    rollout: Rollout, worlds: np.ndarray | slice, horizon: int
-) -> Transitions:
+def rollout_transitions(rollout: Rollout, worlds: np.ndarray | slice, horizon: int) -> Transitions:
     """The transitions [T * n] of some of a rollout's worlds, time-major."""
 
     def flat(array: np.ndarray) -> np.ndarray:

@@ -35,9 +35,7 @@ def request(
     Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
     """
     texts = tuple(str(s) for s in settings_)
-    parameters = Parameters(
-        env=env, settings=texts, agent=agent, seed=seed, evaluation=evaluation
-    )
+    parameters = Parameters(env=env, settings=texts, agent=agent, seed=seed, evaluation=evaluation)
     inputs = {} if policy is None else {"policy": policy}
     label = f"evaluate {agent} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, inputs, label)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,19 +49,21 @@ def train_rounds(
                 row.update(diagnostics)
         rows += newest
         _report(job, trainer, newest)
-
-        def state() -> bytes:
-            return checkpoints.to_bytes(
-                {
-                    "trainer": trainer.state_dict(),
-                    "adversary": adversary.state_dict() if adversary is not None else {},
-                    "round": index + 1,
-                    "rows": json.dumps(rows),
-                }
-            )
-
-        job.checkpoints.offer(state)
+        job.checkpoints.offer(partial(_state, trainer, adversary, index + 1, rows))
     return rows
+
+
+def _state(
+    trainer: PPOTrainer, adversary: Adversary | None, rounds_done: int, rows: Sequence[Row]
+) -> bytes:
+    return checkpoints.to_bytes(
+        {
+            "trainer": trainer.state_dict(),
+            "adversary": adversary.state_dict() if adversary is not None else {},
+            "round": rounds_done,
+            "rows": json.dumps(rows),
+        }
+    )
 
 
 def episode_rows(

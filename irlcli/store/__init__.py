@@ -2,12 +2,12 @@
 
 from irlcli.store.digest import canonical_json, digest, file_digest
 from irlcli.store.manifest import (
-    read_json,
     KeyRecord,
     Manifest,
     Output,
     content_digest,
     directory_outputs,
+    read_json,
 )
 from irlcli.store.scratch import Scratch
 from irlcli.store.store import Artefact, Published, Resolved, Store

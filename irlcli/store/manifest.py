@@ -132,7 +132,11 @@ def read_manifest(directory: Path) -> Manifest:
     """
     path = directory / MANIFEST
     value = read_json(path)
-    if isinstance(value, dict) and isinstance(value.get("schema"), int) and value["schema"] > SCHEMA:
+    if (
+        isinstance(value, dict)
+        and isinstance(value.get("schema"), int)
+        and value["schema"] > SCHEMA
+    ):
         raise IntegrityError(
             f"{path} has schema {value['schema']}, newer than the {SCHEMA} known here",
             "it was written by a newer irlcli: upgrade this one",
@@ -167,9 +171,7 @@ def _parse_manifest(value: Any) -> Manifest:
         outputs.append(Output(check_output_path(item["path"]), item["size"], item["sha256"]))
     if len({o.path for o in outputs}) != len(outputs):
         raise ValueError("an output path appears twice")
-    record = KeyRecord(
-        value["stage"], value["stage_version"], value["parameters"], value["inputs"]
-    )
+    record = KeyRecord(value["stage"], value["stage_version"], value["parameters"], value["inputs"])
     canonical_json(record.as_json())
     return Manifest(record, tuple(outputs))
 

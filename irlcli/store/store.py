@@ -134,13 +134,12 @@ class Store:
                     f"{self.root} is a store of format {version}, newer than the {FORMAT} known here",
                     "it was made by a newer irlcli: upgrade this one, or name another --store",
                 )
-        elif self.root.exists() and any(p.name != ".locks" for p in self.root.iterdir()):
-            # A crash between creating the directories and the marker leaves only those.
-            if not all(p.name.startswith(".") for p in self.root.iterdir()):
-                raise IntegrityError(
-                    f"{self.root} has files in it but is no store",
-                    "name an empty or a new directory with --store",
-                )
+        elif self.root.exists() and any(not p.name.startswith(".") for p in self.root.iterdir()):
+            # Hidden directories alone may be a store whose creation was cut short.
+            raise IntegrityError(
+                f"{self.root} has files in it but is no store",
+                "name an empty or a new directory with --store",
+            )
 
     # Layout
 
@@ -232,7 +231,9 @@ class Store:
     def ids(self) -> list[str]:
         """The ids of all artefacts, sorted."""
         try:
-            return sorted(entry.name for entry in os.scandir(self.root) if re.fullmatch(_ID, entry.name))
+            return sorted(
+                entry.name for entry in os.scandir(self.root) if re.fullmatch(_ID, entry.name)
+            )
         except FileNotFoundError:
             return []
 
@@ -349,9 +350,7 @@ class Store:
         """Whether an interrupted run of ``key`` left something to go on from."""
         return (self._work() / key / "checkpoint").exists()
 
-    def publish(
-        self, record: KeyRecord, output: Path, provenance: dict[str, Any]
-    ) -> Published:
+    def publish(self, record: KeyRecord, output: Path, provenance: dict[str, Any]) -> Published:
         """Turn the directory ``output`` (under ``.work``) into the artefact of ``record``.
 
         The files are made durable and read-only, the manifest is written last, the directory
