@@ -178,17 +178,17 @@ def stack(mdps: Sequence[TabularMDP]) -> Settings:
     )
 
 
-Backup = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Action values [A, E*S, R] to (policy [A, E*S, R], state value [E*S, R]); may overwrite its input."""
+Backup = Callable[[np.ndarray], np.ndarray]
+"""Turns action values [A, E*S, ...] into the policy, in place; returns state values [E*S, ...]."""
 
 
-def hard_backup(action_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The greedy policy, uniform over ties, and max_a Q. A :data:`Backup`."""
+def hard_backup(action_values: np.ndarray) -> np.ndarray:
+    """max_a Q; the policy is greedy, uniform over ties. A :data:`Backup`."""
     best = action_values.max(0)
     slack = TIE_TOLERANCE * np.maximum(1.0, np.abs(best))
-    policy = (action_values >= best - slack).astype(np.float64)
-    policy /= policy.sum(0)
-    return policy, best
+    np.greater_equal(action_values, best - slack, out=action_values)
+    action_values /= action_values.sum(0)
+    return best
 
 
 def backward(
@@ -215,16 +215,17 @@ def backward(
         raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
     if not 0.0 < discount <= 1.0:
         raise ValueError(f"the discount must lie in (0, 1], not {discount}")
-    runs = flat.shape[1]
-    policy = np.empty((horizon, a, e * n, runs))
+    policy = np.empty((horizon, a, *flat.shape))
     value = flat
     for t in reversed(range(horizon)):
         after = settings.spread @ value
         if discount != 1.0:
             after *= discount
-        policy[t], value = backup(after.take(settings.afterstate, axis=0))
-        value = value + flat
-    return policy.reshape(horizon, a, e, n, runs), value.reshape(e, n, runs)
+        # The indices are known to be in range; "clip" lets take write without a buffer.
+        after.take(settings.afterstate, axis=0, out=policy[t], mode="clip")
+        value = backup(policy[t])
+        value += flat
+    return policy.reshape(horizon, a, e, n, -1), value.reshape(e, n, -1)
 
 
 def forward(
@@ -237,15 +238,17 @@ def forward(
         episode that has ended is in no state, so that a distribution may sum to less than one.
     """
     horizon, a, e, n, runs = policy.shape
-    state = np.repeat(settings.start.reshape(e * n, 1), runs, axis=1)
+    columns = (e * n,) if runs == 1 else (e * n, runs)
+    steps = policy.reshape(horizon, a, *columns)
+    state = np.broadcast_to(settings.start.reshape(e * n, 1), (e * n, runs)).reshape(columns)
     occupancy = state.copy()
-    flow = np.empty((a, e * n, runs))
+    flow = np.empty((a, *columns))
+    inflow = flow.reshape(a * e * n, *columns[1:])
     for t in range(horizon):
-        np.multiply(policy[t].reshape(a, e * n, runs), state, out=flow)
-        state = settings.spread_transposed @ (settings.collect @ flow.reshape(-1, runs))
+        np.multiply(steps[t], state, out=flow)
+        state = settings.spread_transposed @ (settings.collect @ inflow)
         occupancy += state if discount == 1.0 else discount ** (t + 1) * state
-    shape = (e, n, runs)
-    return tuple(np.ascontiguousarray(x.reshape(shape).transpose(2, 0, 1)) for x in (occupancy, state))
+    return _runs_first(settings, occupancy), _runs_first(settings, state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +300,7 @@ def true_reward(settings: Settings) -> np.ndarray:
 
 
 def _flatten(settings: Settings, reward: np.ndarray) -> np.ndarray:
-    """[R, S] or [R, E, S] as [E * S, R]."""
+    """[R, S] or [R, E, S] as [E * S, R], or [E * S] if R = 1: half the time of one column."""
     e, n, _ = settings.shape
     reward = np.asarray(reward, dtype=np.float64)
     if reward.shape[1:] not in ((n,), (e, n)):
@@ -306,4 +309,12 @@ def _flatten(settings: Settings, reward: np.ndarray) -> np.ndarray:
         raise ValueError("the reward is not finite")
     if reward.ndim == 2:
         reward = np.broadcast_to(reward[:, None], (len(reward), e, n))
-    return np.ascontiguousarray(reward.transpose(1, 2, 0).reshape(e * n, -1))
+    if len(reward) == 1:
+        return reward.reshape(e * n)
+    return np.ascontiguousarray(reward.reshape(-1, e * n).T)
+
+
+def _runs_first(settings: Settings, array: np.ndarray) -> np.ndarray:
+    """[E * S, R] or [E * S] as [R, E, S]."""
+    e, n, _ = settings.shape
+    return np.ascontiguousarray(array.reshape(e * n, -1).T).reshape(-1, e, n)

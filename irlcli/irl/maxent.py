@@ -48,15 +48,17 @@ def solve(settings: Settings, reward: np.ndarray, horizon: int, discount: float 
     Raises:
         ValueError: as :func:`irlcli.tabular.backward`.
     """
-    no_choice = np.where(settings.terminal, np.log(settings.shape[2]), 0.0)[:, None]
+    ended = np.flatnonzero(settings.terminal)
 
-    def soft_backup(action_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        best = action_values.max(0)
-        action_values -= best
-        weight = np.exp(action_values, out=action_values)
-        total = weight.sum(0)
-        weight /= total
-        return weight, best + np.log(total) - no_choice
+    def soft_backup(action_values: np.ndarray) -> np.ndarray:
+        value = action_values.max(0)
+        action_values -= value
+        np.exp(action_values, out=action_values)
+        total = action_values.sum(0)
+        action_values /= total
+        value += np.log(total, out=total)
+        value[ended] -= np.log(len(action_values))
+        return value
 
     policy, value = backward(settings, reward, horizon, soft_backup, discount)
     occupancy, final = forward(settings, policy, discount)
