@@ -30,7 +30,7 @@ class TabularMDP:
 
     Attributes:
         afterstate: [A, S] int64, where action a leads from state s before chance acts.
-        successor: [X, K] int64.
+        successor: [X, K] int64, the intended one first.
         probability: [X, K] float64; a row sums to one, or is all zero: the episode has ended.
         start: [S] float64, distribution of the first state.
         reward: [S] float64, the true reward of acting in a state.
@@ -101,19 +101,18 @@ def dense_transitions(mdp: TabularMDP) -> np.ndarray:
 
 
 def shortest_path_length(mdp: TabularMDP) -> int:
-    """The fewest steps in which the goal can be reached from any possible first state.
+    """The fewest steps from any possible first state to the goal if every move goes as intended.
 
     Raises:
         ValueError: the goal cannot be reached.
     """
-    possible = mdp.probability > 0.0
+    possible = mdp.probability[:, 0] > 0.0
     reached = mdp.start > 0.0
     steps = 0
     while not reached[mdp.goal]:
-        after = np.zeros(len(possible), dtype=bool)
-        after[mdp.afterstate[:, reached]] = True
+        after = mdp.afterstate[:, reached].ravel()
         grown = reached.copy()
-        grown[mdp.successor[after][possible[after]]] = True
+        grown[mdp.successor[after[possible[after]], 0]] = True
         if (grown == reached).all():
             raise ValueError("the goal cannot be reached from the start")
         reached = grown
