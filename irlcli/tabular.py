@@ -21,6 +21,7 @@ import numpy as np
 from scipy import sparse
 
 DENSE_LIMIT = 1024  # states; four actions then take 32 MiB
+MEMORY_LIMIT = 8 * 2**30  # bytes of a policy
 TIE_TOLERANCE = 1e-9  # relative: actions whose values differ by less are equally good
 
 
@@ -206,7 +207,7 @@ def backward(
 
     Raises:
         ValueError: a reward of another shape or not finite, a horizon below 1, a discount
-            outside (0, 1].
+            outside (0, 1], or a policy of more than ``MEMORY_LIMIT`` bytes.
     """
     e, n, a = settings.shape
     flat = _flatten(settings, reward)
@@ -214,6 +215,12 @@ def backward(
         raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
     if not 0.0 < discount <= 1.0:
         raise ValueError(f"the discount must lie in (0, 1], not {discount}")
+    size = 8 * horizon * a * flat.size
+    if size > MEMORY_LIMIT:
+        raise ValueError(
+            f"{e} x {n} states, {horizon} steps and {flat.size // (e * n)} runs are too many for "
+            f"the exact solver: {size / 2**30:.0f} GiB, the limit is {MEMORY_LIMIT / 2**30:.0f}"
+        )
     policy = np.empty((horizon, a, *flat.shape))
     value = flat
     for t in reversed(range(horizon)):

@@ -106,6 +106,12 @@ def test_a_grid_too_large_for_the_dense_solver_is_refused():
         dense_transitions(large)
 
 
+def test_a_grid_too_large_for_the_exact_solver_is_refused():
+    settings = stack([gridworld(256)])
+    with pytest.raises(ValueError, match="too many for the exact solver: 100 GiB"):
+        backward(settings, np.zeros((100, 256**2)), 512, hard_backup)
+
+
 def test_an_unreachable_goal_is_refused():
     mdp = random_mdp(0)
     stuck = dataclasses.replace(mdp, successor=np.zeros_like(mdp.successor), start=np.eye(7)[0])

@@ -25,7 +25,6 @@ import gymnasium
 import numpy as np
 
 from irlcli.tabular import (
-    Settings,
     TabularMDP,
     optimal_policy,
     shortest_path_length,
@@ -37,7 +36,7 @@ from irlcli.trajectories import Trajectory
 Goal = Literal["terminal", "absorbing"]
 PATH_GROUPS = (1, 2, 3)
 _MOVES = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)])  # (dx, dy) of up, right, down, left
-_LARGEST = 1024  # cells a side; beyond it float32 observations lose no cell, but memory is gone
+_LARGEST = 1024  # cells a side: a million states
 _SMALLEST_WITH_PATHS = 5
 
 
@@ -152,7 +151,7 @@ def expert_policy(mdp: TabularMDP, horizon: int) -> np.ndarray:
     Raises:
         ValueError: the goal is further away than the horizon.
     """
-    settings: Settings = stack([mdp])
+    settings = stack([mdp])
     return optimal_policy(settings, true_reward(settings), horizon)[0][:, :, 0, :, 0]
 
 
@@ -170,7 +169,8 @@ def sample_trajectories(
     if episodes < 1:
         raise ValueError(f"at least one episode is needed, not {episodes}")
     horizon = len(policy)
-    draws = np.stack([np.random.default_rng(seed + i).random((horizon + 1, 2)) for i in range(episodes)])
+    generators = [np.random.default_rng(seed + i) for i in range(episodes)]
+    draws = np.stack([g.random((horizon + 1, 2)) for g in generators])
     state = np.searchsorted(np.cumsum(mdp.start), draws[:, horizon, 0], side="right")
     states = np.empty((episodes, horizon + 1), dtype=np.int64)
     actions = np.empty((episodes, horizon), dtype=np.int64)
@@ -204,7 +204,8 @@ def _choose(probability: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """Index drawn from each row of ``probability`` [B, K] by inversion of ``uniform`` [B]."""
     cumulative = np.cumsum(probability, 1)
     # Scaled by the total, so that rounding cannot push a draw past the last possible index.
-    return (cumulative <= uniform[:, None] * cumulative[:, -1:]).sum(1).clip(max=probability.shape[1] - 1)
+    passed = (cumulative <= uniform[:, None] * cumulative[:, -1:]).sum(1)
+    return passed.clip(max=probability.shape[1] - 1)
 
 
 class Gridworld(gymnasium.Env[np.ndarray, np.int64]):

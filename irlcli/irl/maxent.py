@@ -134,6 +134,23 @@ def demonstrations(
     return Demonstrations(tuple(cut_states), tuple(cut_actions))
 
 
+def shuffle_settings(demos: Demonstrations, seed: int) -> Demonstrations:
+    """The same trajectories dealt out to the settings at random, as many to each as before.
+
+    The control for invariance: a method that gains as much from labels that mean nothing gains
+    from regularisation.
+    """
+    counts = demos.counts
+    order = np.random.default_rng(seed).permutation(counts.sum())
+    states = [path for group in demos.states for path in group]
+    actions = [moves for group in demos.actions for moves in group]
+    parts = np.split(order, np.cumsum(counts)[:-1])
+    return Demonstrations(
+        tuple(tuple(states[i] for i in part) for part in parts),
+        tuple(tuple(actions[i] for i in part) for part in parts),
+    )
+
+
 def expert_occupancy(
     settings: Settings, demos: Demonstrations, horizon: int, discount: float = 1.0
 ) -> np.ndarray:
@@ -151,13 +168,16 @@ def expert_occupancy(
 
 
 def log_likelihood(solution: Solution, run: int, demos: Demonstrations) -> np.ndarray:
-    """sum_t log pi_t(a_t|s_t) per trajectory, on average over each setting [E], in nats."""
+    """sum_t log pi_t(a_t|s_t) per trajectory, on average over each setting [E], in nats.
+
+    A probability too small for a float64 counts as the smallest one, about -708 nats.
+    """
     result = np.empty(len(demos.states))
     for i, (paths, moves) in enumerate(zip(demos.states, demos.actions, strict=True)):
         t = np.concatenate([np.arange(len(m)) for m in moves])
         s = np.concatenate([p[:-1] for p in paths])
         chosen = solution.policy[t, np.concatenate(moves), i, s, run]
-        result[i] = np.log(chosen).sum() / len(paths)
+        result[i] = np.log(np.maximum(chosen, np.finfo(float).tiny)).sum() / len(paths)
     return result
 
 
@@ -270,7 +290,7 @@ def fit(
 
     Raises:
         ValueError: shapes that do not fit; weights, penalty weights or l2 negative or NaN; a
-            horizon, discount or iterations out of range.
+            horizon, discount, width, rate or number of iterations out of range.
         UsageError: an unknown penalty.
     """
     e, n, _ = settings.shape
@@ -292,6 +312,8 @@ def fit(
             raise ValueError(f"{name} must be finite and not negative")
     if iterations < 1:
         raise ValueError(f"at least one iteration is needed, not {iterations}")
+    if hidden < 0:
+        raise ValueError(f"hidden must be a width, or 0 for a linear reward, not {hidden}")
     networks = RewardNetworks(features.shape[1], hidden, seeds)
     inputs = torch.as_tensor(features)
     decay = torch.as_tensor(np.asarray(l2, dtype=np.float64)).reshape(runs, 1, 1)

@@ -23,6 +23,7 @@ from irlcli.irl.maxent import (
     fit,
     log_likelihood,
     setting_weights,
+    shuffle_settings,
     solve,
 )
 from irlcli.irl.maxent_penalties import PENALTIES, penalty, penalty_gradient
@@ -181,7 +182,8 @@ def test_linear_fit_matches_features_at_the_optimum():
         settings, features, expert, weights, np.zeros(1), np.zeros(1), [0], hidden=0, **FIT
     )
     gap = np.einsum("re,res->s", weights, expert - result.solution.occupancy)
-    start = np.einsum("re,res->s", weights, expert - solve(settings, np.zeros((1, 25)), 12).occupancy)
+    uniform = solve(settings, np.zeros((1, 25)), 12).occupancy
+    start = np.einsum("re,res->s", weights, expert - uniform)
     assert np.abs(features.T @ start).max() > 1.0
     assert np.abs(features.T @ gap).max() < 1e-6
     assert np.allclose(result.reward[0], features @ result.networks.psi.detach().numpy()[0, :, 0])
@@ -291,6 +293,28 @@ def test_log_likelihood_by_hand():
     assert log_likelihood(uniform, 0, demos).max() < 0.0
 
 
+def test_an_impossible_action_has_a_finite_log_likelihood():
+    settings = stack([gridworld(3)])
+    demos = demonstrations(settings, [[PATH]], [[MOVES]], 6)
+    reward = np.zeros((1, 9))
+    reward[0, 3] = 1e5  # beside the path, so that leaving it is a certainty
+    assert -4 * 709 < log_likelihood(solve(settings, reward, 6), 0, demos)[0] < -700
+
+
+def test_shuffled_settings_hold_the_same_trajectories():
+    settings = stack([gridworld(3), gridworld(3)])
+    short, long = PATH, np.array([0, 0, 1, 2, 5, 8])
+    moves = np.array([3, 1, 1, 0, 0])
+    demos = demonstrations(settings, [[short] * 4, [long]], [[MOVES] * 4, [moves]], 6)
+    dealt = [shuffle_settings(demos, seed) for seed in range(20)]
+    assert {len(d.states[1][0]) for d in dealt} == {5, 6}
+    for d in dealt:
+        assert d.counts.tolist() == [4, 1]
+        assert sorted(len(p) for group in d.states for p in group) == [5, 5, 5, 5, 6]
+        for group, choices in zip(d.states, d.actions, strict=True):
+            assert all(len(p) == len(m) + 1 for p, m in zip(group, choices, strict=True))
+
+
 def test_weights_pool_by_count_or_balance():
     assert np.allclose(setting_weights("erm", np.array([400, 25, 3])), np.array([400, 25, 3]) / 428)
     for method in ("erm-balanced", "irm"):
@@ -344,6 +368,8 @@ def test_bad_demonstrations_are_refused():
         ({"features": np.ones((8, 2))}, "features must be"),
         ({"features": np.full((9, 2), np.nan)}, "features must be"),
         ({"iterations": 0}, "at least one iteration"),
+        ({"hidden": -1}, "hidden must be"),
+        ({"learning_rate": float("nan")}, "learning rate"),
         ({"horizon": 0}, "horizon must be"),
     ],
 )
