@@ -47,7 +47,7 @@ np.savez(sys.argv[2], policy=policy, states=states, times=times)
 
 
 def dense_solve(transitions, start, reward, horizon):
-    """``mce_partition_fh``, then ``mce_occupancy_measures``: policy [T, S, A], states [T + 1, S]."""
+    """``mce_partition_fh``, ``mce_occupancy_measures``: policy [T, S, A], states [T + 1, S]."""
     n, a, _ = transitions.shape
     values = np.tile(reward[:, None], (1, a))
     policy = np.empty((horizon, n, a))

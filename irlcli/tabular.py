@@ -21,7 +21,7 @@ import numpy as np
 from scipy import sparse
 
 DENSE_LIMIT = 1024  # states; four actions then take 32 MiB
-MEMORY_LIMIT = 8 * 2**30  # bytes of a policy
+MEMORY_LIMIT = 8 * 2**30  # bytes
 TIE_TOLERANCE = 1e-9  # relative: actions whose values differ by less are equally good
 
 
@@ -126,7 +126,8 @@ class Settings:
     """E MDPs of one shape, as one block-diagonal sparse MDP over E * S states.
 
     Made by :func:`stack`. ``spread`` [E*X, E*S] takes values of states to values of afterstates;
-    ``collect`` [E*X, A*E*S] adds up what the actions send to each afterstate.
+    ``collect`` [E*X, A*E*S] adds up what the actions send to each afterstate; ``arrivals``
+    [E*X, E*S] counts the actions that lead from a state to an afterstate.
     """
 
     mdps: tuple[TabularMDP, ...]
@@ -134,6 +135,7 @@ class Settings:
     spread: sparse.csr_array
     spread_transposed: sparse.csr_array
     collect: sparse.csr_array
+    arrivals: sparse.csr_array
     terminal: np.ndarray  # [E*S] bool
     start: np.ndarray  # [E, S]
 
@@ -154,7 +156,7 @@ def stack(mdps: Sequence[TabularMDP]) -> Settings:
     shapes = {(m.afterstate.shape, m.successor.shape) for m in mdps}
     if len(shapes) > 1:
         raise ValueError(f"MDPs of different shapes cannot be solved together: {sorted(shapes)}")
-    n, (x, k) = mdps[0].n_states, mdps[0].successor.shape
+    (a, n), (x, k) = mdps[0].afterstate.shape, mdps[0].successor.shape
     afterstate = np.concatenate([m.afterstate + e * x for e, m in enumerate(mdps)], axis=1)
     successor = np.concatenate([m.successor + e * n for e, m in enumerate(mdps)])
     probability = np.concatenate([m.probability for m in mdps])
@@ -173,6 +175,7 @@ def stack(mdps: Sequence[TabularMDP]) -> Settings:
         spread=spread,
         spread_transposed=spread.T.tocsr(),
         collect=collect,
+        arrivals=collect @ sparse.vstack([sparse.eye_array(len(mdps) * n, format="csr")] * a),
         terminal=np.concatenate([m.terminal for m in mdps]),
         start=np.stack([m.start for m in mdps]),
     )
@@ -206,21 +209,11 @@ def backward(
         The policy pi_t(a|s) [H, A, E, S, R] and V_0 [E, S, R].
 
     Raises:
-        ValueError: a reward of another shape or not finite, a horizon below 1, a discount
-            outside (0, 1], or a policy of more than ``MEMORY_LIMIT`` bytes.
+        ValueError: a reward of another shape or not finite; or as :func:`check_size`.
     """
     e, n, a = settings.shape
-    flat = _flatten(settings, reward)
-    if horizon < 1:
-        raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
-    if not 0.0 < discount <= 1.0:
-        raise ValueError(f"the discount must lie in (0, 1], not {discount}")
-    size = 8 * horizon * a * flat.size
-    if size > MEMORY_LIMIT:
-        raise ValueError(
-            f"{e} x {n} states, {horizon} steps and {flat.size // (e * n)} runs are too many for "
-            f"the exact solver: {size / 2**30:.0f} GiB, the limit is {MEMORY_LIMIT / 2**30:.0f}"
-        )
+    flat = columns(settings, reward)
+    check_size(horizon, discount, a * flat.size)
     policy = np.empty((horizon, a, *flat.shape))
     value = flat
     for t in reversed(range(horizon)):
@@ -244,17 +237,16 @@ def forward(
         episode that has ended is in no state, so that a distribution may sum to less than one.
     """
     horizon, a, e, n, runs = policy.shape
-    columns = (e * n,) if runs == 1 else (e * n, runs)
-    steps = policy.reshape(horizon, a, *columns)
-    state = np.broadcast_to(settings.start.reshape(e * n, 1), (e * n, runs)).reshape(columns)
+    state = columns(settings, np.broadcast_to(settings.start, (runs, e, n)))
+    steps = policy.reshape(horizon, a, *state.shape)
     occupancy = state.copy()
-    flow = np.empty((a, *columns))
-    inflow = flow.reshape(a * e * n, *columns[1:])
+    flow = np.empty((a, *state.shape))
+    outflow = flow.reshape(a * e * n, *state.shape[1:])
     for t in range(horizon):
         np.multiply(steps[t], state, out=flow)
-        state = settings.spread_transposed @ (settings.collect @ inflow)
+        state = settings.spread_transposed @ (settings.collect @ outflow)
         occupancy += state if discount == 1.0 else discount ** (t + 1) * state
-    return _runs_first(settings, occupancy), _runs_first(settings, state)
+    return runs_first(settings, occupancy), runs_first(settings, state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,22 +297,44 @@ def true_reward(settings: Settings) -> np.ndarray:
     return np.stack([m.reward for m in settings.mdps])[None]
 
 
-def _flatten(settings: Settings, reward: np.ndarray) -> np.ndarray:
-    """[R, S] or [R, E, S] as [E * S, R], or [E * S] if R = 1: half the time of one column."""
+def columns(settings: Settings, array: np.ndarray) -> np.ndarray:
+    """[R, S] or [R, E, S] as [E * S, R], or as [E * S] if R = 1: half the time of one column.
+
+    Raises:
+        ValueError: another shape, or numbers that are not finite.
+    """
     e, n, _ = settings.shape
-    reward = np.asarray(reward, dtype=np.float64)
-    if reward.shape[1:] not in ((n,), (e, n)):
-        raise ValueError(f"reward must be [R, {n}] or [R, {e}, {n}], not {list(reward.shape)}")
-    if not np.isfinite(reward).all():
+    array = np.asarray(array, dtype=np.float64)
+    if array.shape[1:] not in ((n,), (e, n)):
+        raise ValueError(f"reward must be [R, {n}] or [R, {e}, {n}], not {list(array.shape)}")
+    if not np.isfinite(array).all():
         raise ValueError("the reward is not finite")
-    if reward.ndim == 2:
-        reward = np.broadcast_to(reward[:, None], (len(reward), e, n))
-    if len(reward) == 1:
-        return reward.reshape(e * n)
-    return np.ascontiguousarray(reward.reshape(-1, e * n).T)
+    if array.ndim == 2:
+        array = np.broadcast_to(array[:, None], (len(array), e, n))
+    if len(array) == 1:
+        return array.reshape(e * n)
+    return np.ascontiguousarray(array.reshape(-1, e * n).T)
 
 
-def _runs_first(settings: Settings, array: np.ndarray) -> np.ndarray:
+def runs_first(settings: Settings, array: np.ndarray) -> np.ndarray:
     """[E * S, R] or [E * S] as [R, E, S]."""
     e, n, _ = settings.shape
     return np.ascontiguousarray(array.reshape(e * n, -1).T).reshape(-1, e, n)
+
+
+def check_size(horizon: int, discount: float, numbers: int) -> None:
+    """Refuse what :func:`backward` cannot solve, or what keeps too many ``numbers`` per step.
+
+    Raises:
+        ValueError: a horizon below 1, a discount outside (0, 1], or more than ``MEMORY_LIMIT``.
+    """
+    if horizon < 1:
+        raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
+    if not 0.0 < discount <= 1.0:
+        raise ValueError(f"the discount must lie in (0, 1], not {discount}")
+    size = 8 * horizon * numbers
+    if size > MEMORY_LIMIT:
+        raise ValueError(
+            f"too many states, steps or runs for the exact solver: it would keep "
+            f"{size / 2**30:.0f} GiB, the limit is {MEMORY_LIMIT / 2**30:.0f}"
+        )

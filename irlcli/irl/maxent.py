@@ -19,27 +19,51 @@ from scipy.stats import spearmanr
 
 from irlcli.errors import UsageError, suggest
 from irlcli.irl.maxent_penalties import penalty, penalty_gradient
-from irlcli.tabular import Settings, backward, evaluate, forward, optimal_policy, true_reward
+from irlcli.tabular import (
+    Settings,
+    check_size,
+    columns,
+    evaluate,
+    forward,
+    optimal_policy,
+    runs_first,
+    true_reward,
+)
 
 METHODS = ("erm", "erm-balanced", "irm")
 
 
+SAFE_SPAN = 600.0  # nats: exp of no more than this neither over- nor underflows
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The maximum-causal-entropy policy of R rewards in E settings."""
+    """The maximum-causal-entropy policy of R rewards in E settings.
 
-    policy: np.ndarray  # [H, A, E, S, R], pi_t(a|s)
+    log pi_t(a|s) = log_weight[t, afterstate(a, s)] - log_total[t, s]: with afterstates the policy
+    need not be kept for each action.
+    """
+
+    settings: Settings
+    log_weight: np.ndarray  # [H, E * X, R], gamma E[V_{t+1}] from each afterstate
+    log_total: np.ndarray  # [H, E * S, R], log sum_a exp of it
     log_partition: np.ndarray  # [R, E], E[V_0] over the start distribution; its gradient is ...
     occupancy: np.ndarray  # ... [R, E, S], sum_{t=0..H} gamma^t P(s_t = s)
-    final: np.ndarray  # [R, E, S], P(s_H = s)
+
+    @property
+    def policy(self) -> np.ndarray:
+        """pi_t(a|s) as [H, A, E, S, R], as :func:`irlcli.tabular.evaluate` takes it."""
+        e, n, a = self.settings.shape
+        weight = self.log_weight[:, self.settings.afterstate]
+        return np.exp(weight - self.log_total[:, None]).reshape(-1, a, e, n, weight.shape[-1])
 
 
 def solve(settings: Settings, reward: np.ndarray, horizon: int, discount: float = 1.0) -> Solution:
     """Soft backward pass and forward pass with the same horizon and discount.
 
     V_H = r, Q_t(s, a) = gamma E[V_{t+1}], V_t = r + log sum_a exp Q_t, pi_t = exp(Q_t - log sum).
-    Where the episode has ended nothing is chosen, so that no log A is added; an absorbing state's
-    actions are choices like any other's.
+    Where the episode has ended nothing is chosen, so that V_t = r; an absorbing state's actions
+    are choices like any other's.
 
     Args:
         reward: [R, S], or [R, E, S].
@@ -48,21 +72,52 @@ def solve(settings: Settings, reward: np.ndarray, horizon: int, discount: float 
     Raises:
         ValueError: as :func:`irlcli.tabular.backward`.
     """
+    e, n, a = settings.shape
+    flat = columns(settings, reward)
+    afterstates = len(settings.mdps[0].successor) * e
+    check_size(horizon, discount, (afterstates + e * n) * (flat.size // (e * n)))
     ended = np.flatnonzero(settings.terminal)
-
-    def soft_backup(action_values: np.ndarray) -> np.ndarray:
-        value = action_values.max(0)
-        action_values -= value
-        np.exp(action_values, out=action_values)
-        total = action_values.sum(0)
-        action_values /= total
-        value += np.log(total, out=total)
-        value[ended] -= np.log(len(action_values))
-        return value
-
-    policy, value = backward(settings, reward, horizon, soft_backup, discount)
-    occupancy, final = forward(settings, policy, discount)
-    return Solution(policy, np.einsum("es,esr->re", settings.start, value), occupancy, final)
+    log_weight = np.empty((horizon, afterstates, *flat.shape[1:]))
+    log_total = np.empty((horizon, *flat.shape))
+    # What each step's weights are scaled by to take exp once per afterstate, not per action. Where
+    # they span too much for that, None: each state's own largest takes the place.
+    scales: list[np.ndarray | None] = [None] * horizon
+    each = np.empty((a, *flat.shape))
+    value = flat
+    for t in reversed(range(horizon)):
+        weight = np.multiply(settings.spread @ value, discount, out=log_weight[t])
+        largest = weight.max(0)
+        if (largest - weight.min(0)).max() <= SAFE_SPAN:
+            scales[t] = largest
+            np.exp(weight - largest).take(settings.afterstate, axis=0, out=each, mode="clip")
+        else:
+            weight.take(settings.afterstate, axis=0, out=each, mode="clip")
+            largest = each.max(0)
+            np.exp(each - largest, out=each)
+        total = np.log(each.sum(0), out=log_total[t])
+        total += largest
+        value = total + flat
+        value[ended] = flat[ended]
+    state = columns(settings, np.broadcast_to(settings.start, (value.size // (e * n), e, n)))
+    occupancy = state.copy()
+    for t, scale in enumerate(scales):
+        if scale is not None:
+            arriving = settings.arrivals @ (state * np.exp(scale - log_total[t]))
+            arriving *= np.exp(log_weight[t] - scale)
+        else:
+            log_weight[t].take(settings.afterstate, axis=0, out=each, mode="clip")
+            np.exp(each - log_total[t], out=each)
+            each *= state
+            arriving = settings.collect @ each.reshape(a * e * n, *state.shape[1:])
+        state = settings.spread_transposed @ arriving
+        occupancy += state if discount == 1.0 else discount ** (t + 1) * state
+    return Solution(
+        settings=settings,
+        log_weight=log_weight.reshape(horizon, afterstates, -1),
+        log_total=log_total.reshape(horizon, e * n, -1),
+        log_partition=(runs_first(settings, value) * settings.start).sum(-1),
+        occupancy=runs_first(settings, occupancy),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,16 +223,15 @@ def expert_occupancy(
 
 
 def log_likelihood(solution: Solution, run: int, demos: Demonstrations) -> np.ndarray:
-    """sum_t log pi_t(a_t|s_t) per trajectory, on average over each setting [E], in nats.
-
-    A probability too small for a float64 counts as the smallest one, about -708 nats.
-    """
+    """sum_t log pi_t(a_t|s_t) per trajectory, on average over each setting [E], in nats."""
+    _, n, _ = solution.settings.shape
     result = np.empty(len(demos.states))
-    for i, (paths, moves) in enumerate(zip(demos.states, demos.actions, strict=True)):
+    for e, (paths, moves) in enumerate(zip(demos.states, demos.actions, strict=True)):
         t = np.concatenate([np.arange(len(m)) for m in moves])
-        s = np.concatenate([p[:-1] for p in paths])
-        chosen = solution.policy[t, np.concatenate(moves), i, s, run]
-        result[i] = np.log(np.maximum(chosen, np.finfo(float).tiny)).sum() / len(paths)
+        s = np.concatenate([p[:-1] for p in paths]) + e * n
+        after = solution.settings.afterstate[np.concatenate(moves), s]
+        log_policy = solution.log_weight[t, after, run] - solution.log_total[t, s, run]
+        result[e] = log_policy.sum() / len(paths)
     return result
 
 

@@ -16,6 +16,7 @@ from irlcli.envs.gridworld import (
 )
 from irlcli.errors import UsageError
 from irlcli.irl.maxent import (
+    SAFE_SPAN,
     RewardNetworks,
     assess,
     demonstrations,
@@ -105,6 +106,21 @@ def test_solver_equals_a_dense_one_and_its_gradient_by_autograd(goal, discount):
             partition.backward()
             assert solution.log_partition[r, e] == pytest.approx(partition.item(), abs=1e-11)
             assert np.allclose(solution.occupancy[r, e], leaf.grad.numpy(), atol=1e-11)
+
+
+@pytest.mark.parametrize("goal", GOALS)
+def test_values_that_span_too_much_for_one_scale_are_solved_too(goal):
+    settings = stack([gridworld(6, path_group=g, goal=goal) for g in PATH_GROUPS])
+    reward = 40.0 * np.random.default_rng(9).normal(size=(2, 36))
+    solution = solve(settings, reward, 20)
+    span = np.ptp(solution.log_weight, axis=1)
+    assert (span > SAFE_SPAN).any() and (span < SAFE_SPAN).any()  # either way in one solution
+    for r in range(2):
+        leaf = torch.tensor(reward[r], requires_grad=True)
+        partition = dense_log_partition(settings.mdps[1], leaf, 20, 1.0)
+        partition.backward()
+        assert solution.log_partition[r, 1] == pytest.approx(partition.item(), rel=1e-13)
+        assert np.allclose(solution.occupancy[r, 1], leaf.grad.numpy(), atol=1e-9)
 
 
 @pytest.mark.parametrize("goal", GOALS)
@@ -298,7 +314,8 @@ def test_an_impossible_action_has_a_finite_log_likelihood():
     demos = demonstrations(settings, [[PATH]], [[MOVES]], 6)
     reward = np.zeros((1, 9))
     reward[0, 3] = 1e5  # beside the path, so that leaving it is a certainty
-    assert -4 * 709 < log_likelihood(solve(settings, reward, 6), 0, demos)[0] < -700
+    found = log_likelihood(solve(settings, reward, 6), 0, demos)[0]
+    assert np.isfinite(found) and found < -1e4
 
 
 def test_shuffled_settings_hold_the_same_trajectories():
