@@ -58,7 +58,13 @@ class Solution:
         return np.exp(weight - self.log_total[:, None]).reshape(-1, a, e, n, weight.shape[-1])
 
 
-def solve(settings: Settings, reward: np.ndarray, horizon: int, discount: float = 1.0) -> Solution:
+def solve(
+    settings: Settings,
+    reward: np.ndarray,
+    horizon: int,
+    discount: float = 1.0,
+    reuse: Solution | None = None,
+) -> Solution:
     """Soft backward pass and forward pass with the same horizon and discount.
 
     V_H = r, Q_t(s, a) = gamma E[V_{t+1}], V_t = r + log sum_a exp Q_t, pi_t = exp(Q_t - log sum).
@@ -68,17 +74,23 @@ def solve(settings: Settings, reward: np.ndarray, horizon: int, discount: float 
     Args:
         reward: [R, S], or [R, E, S].
         horizon: H [steps].
+        reuse: a solution of the same shape that is needed no more: its memory is overwritten.
+            Fresh memory may cost as much as the solution itself.
 
     Raises:
-        ValueError: as :func:`irlcli.tabular.backward`.
+        ValueError: as :func:`irlcli.tabular.backward`; or ``reuse`` is of another shape.
     """
     e, n, a = settings.shape
     flat = columns(settings, reward)
     afterstates = len(settings.mdps[0].successor) * e
     check_size(horizon, discount, (afterstates + e * n) * (flat.size // (e * n)))
     ended = np.flatnonzero(settings.terminal)
-    log_weight = np.empty((horizon, afterstates, *flat.shape[1:]))
-    log_total = np.empty((horizon, *flat.shape))
+    if reuse is None:
+        log_weight = np.empty((horizon, afterstates, *flat.shape[1:]))
+        log_total = np.empty((horizon, *flat.shape))
+    else:
+        log_weight = reuse.log_weight.reshape(horizon, afterstates, *flat.shape[1:])
+        log_total = reuse.log_total.reshape(horizon, *flat.shape)
     # What each step's weights are scaled by to take exp once per afterstate, not per action. Where
     # they span too much for that, None: each state's own largest takes the place.
     scales: list[np.ndarray | None] = [None] * horizon
@@ -374,10 +386,11 @@ def fit(
     strength = np.asarray(penalty_weight)[:, None, None]
     optimizer = torch.optim.RMSprop(networks.parameters(), lr=learning_rate)
     records = []
+    solution = None
     for i in range(iterations):
         reward = networks(inputs)
         phi = reward.detach().numpy()
-        solution = solve(settings, phi, horizon, discount)
+        solution = solve(settings, phi, horizon, discount, reuse=solution)
         gap = occupancy - solution.occupancy
         if i % record_every == 0 or i == iterations - 1:
             objective = np.einsum("res,rs->re", occupancy, phi) - solution.log_partition
@@ -394,7 +407,7 @@ def fit(
     return Fit(
         networks=networks,
         reward=phi,
-        solution=solve(settings, phi, horizon, discount),
+        solution=solve(settings, phi, horizon, discount, reuse=solution),
         iterations=np.array(steps),
         objective=np.stack(objectives),
         penalty=np.stack(penalties),

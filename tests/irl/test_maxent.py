@@ -123,6 +123,20 @@ def test_values_that_span_too_much_for_one_scale_are_solved_too(goal):
         assert np.allclose(solution.occupancy[r, 1], leaf.grad.numpy(), atol=1e-9)
 
 
+@pytest.mark.parametrize("runs", [1, 3])
+def test_a_solution_in_used_memory_is_the_same(runs):
+    settings = stack([gridworld(4), gridworld(4)])
+    rng = np.random.default_rng(10)
+    fresh = solve(settings, second := rng.normal(size=(runs, 16)), 9)
+    used = solve(settings, rng.normal(size=(runs, 16)), 9)
+    again = solve(settings, second, 9, reuse=used)
+    assert np.shares_memory(again.log_weight, used.log_weight)
+    assert np.array_equal(again.policy, fresh.policy)
+    assert np.array_equal(again.occupancy, fresh.occupancy)
+    with pytest.raises(ValueError, match="reshape"):
+        solve(settings, second, 8, reuse=used)
+
+
 @pytest.mark.parametrize("goal", GOALS)
 def test_likelihoods_gradient_by_finite_differences(goal):
     """d/dphi(s) sum_e w_e (rho_E . phi - log Z) = sum_e w_e (rho_E - rho_pi)(s)."""
