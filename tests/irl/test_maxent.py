@@ -316,7 +316,7 @@ def test_expert_occupancy_converges_to_the_exact_one():
 def test_log_likelihood_by_hand():
     settings = stack([gridworld(3), gridworld(3)])
     demos = demonstrations(settings, [[PATH], [PATH, PATH[:5]]], [[MOVES], [MOVES, MOVES]], 6)
-    solution = solve(settings, np.random.default_rng(0).normal(size=(2, 9)), 6)
+    solution = solve(settings, np.random.default_rng(0).normal(size=(2, 2, 9)), 6)
     steps = [solution.policy[t, MOVES[t], 1, PATH[t], 1] for t in range(4)]
     assert log_likelihood(solution, 1, demos)[1] == pytest.approx(np.log(steps).sum(), abs=1e-12)
     uniform = solve(settings, np.zeros((1, 9)), 6)
