@@ -30,6 +30,7 @@ NEVER = {
     "settings": HEAVY | OURS | {"numpy"},
     "interventions": HEAVY | OURS | {"numpy", "settings"},
     "trajectories": HEAVY | OURS | {"settings", "pathlib"},
+    "tabular": HEAVY | OURS | {"settings", "pathlib"},
     "store": HEAVY | (OURS - {"store"}) | {"numpy", "msgspec", "settings", "trajectories"},
     "envs": {"torch", "stable_baselines3", "pandas", "pyarrow"} | (OURS - {"envs"}),
     "irl": {"stable_baselines3", "gymnasium", "pandas", "pyarrow", "logging", "pathlib"}

@@ -142,8 +142,13 @@ def test_minibatch_layout_and_share_of_the_past():
     def constant(value):
         data = make_transitions(20)
         observations = np.full_like(data.observations, value)
-        data = Transitions(observations, *[getattr(data, n) for n in
-                           ("actions", "next_observations", "terminated", "remaining")])
+        data = Transitions(
+            observations,
+            *[
+                getattr(data, n)
+                for n in ("actions", "next_observations", "terminated", "remaining")
+            ],
+        )
         return airl.make_pool(model, data, torch.zeros(20), False)
 
     batch = airl.sample_minibatch(
