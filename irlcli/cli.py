@@ -200,6 +200,67 @@ def train_airl(
     session.deliver([train_airl.request(source, env, parsed, config.airl, seed)], name)
 
 
+@command("train-maxent")
+def train_maxent(
+    session: Session,
+    demos: Annotated[str, typer.Option(help="Demonstrations in a gridworld: an artefact.")],
+    method: Annotated[str | None, typer.Option(help="erm, erm-balanced or irm.")] = None,
+    penalty: Annotated[str | None, typer.Option(help="irmv1 or closed-form.")] = None,
+    penalty_weight: Annotated[float | None, typer.Option(help="lambda of IRM.")] = None,
+    l2: Annotated[float | None, typer.Option(help="Weight decay.")] = None,
+    features: Annotated[str | None, typer.Option(help="learned or linear.")] = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Learn a reward from demonstrations in a gridworld, exactly."""
+    from irlcli.interventions import check_tabular, parse_setting
+    from irlcli.references import demonstrations
+    from irlcli.stages import train_maxent
+
+    source, env, settings = demonstrations(session.store, demos)
+    check_tabular(env, "train-maxent", wanted=True)
+    flags = {
+        "maxent.method": method,
+        "maxent.penalty": penalty,
+        "maxent.penalty_weight": penalty_weight,
+        "maxent.l2": l2,
+        "maxent.features": features,
+    }
+    config = session.settings(env, flags)
+    parsed = [parse_setting(env, text) for text in settings]
+    request = train_maxent.request(source, env, parsed, _unseen(env, config), config.maxent, seed)
+    artefacts = session.deliver([request], name)
+    if artefacts and not session.as_json:
+        _print_quality(session, artefacts[0])
+
+
+def _unseen(env: str, config: Any) -> list[Any]:
+    """Every OOD setting that the settings file names."""
+    from irlcli.interventions import parse_setting
+
+    return [
+        parse_setting(env, f"{knob}={value}")
+        for knob, values in config.interventions.items()
+        for value in values.ood
+    ]
+
+
+def _print_quality(session: Session, artefact: Any) -> None:
+    from irlcli.store import read_json
+
+    measures = ("goal_probability", "true_return", "value_difference", "rank_correlation")
+    rows = [
+        [
+            row["setting"] + ("" if row["seen"] else " (unseen)"),
+            *("-" if row[m] is None else f"{row[m]:.2f}" for m in measures),
+            f"{row['log_likelihood']:.1f}",
+        ]
+        for row in read_json(session.store.open(artefact, "quality.json"))["settings"]
+    ]
+    columns = ["setting", *(m.replace("_", " ") for m in measures), "log-likelihood"]
+    out.print_table(columns, rows, stderr=True)
+
+
 @command("transfer")
 def transfer(
     session: Session,
@@ -389,7 +450,7 @@ def _about(parameters: dict[str, Any]) -> str:
     """The parameters that tell one artefact of a stage from another."""
     settings = parameters.get("settings") or [parameters.get("setting")]
     parts = [parameters.get("env"), parameters.get("agent"), *settings]
-    parts.append(parameters.get("airl", {}).get("method"))
+    parts.append((parameters.get("airl") or parameters.get("maxent") or {}).get("method"))
     parts.append(f"seed {parameters['seed']}" if "seed" in parameters else None)
     return " ".join(str(p) for p in parts if p and p != "policy")
 

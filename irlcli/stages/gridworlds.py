@@ -126,7 +126,7 @@ def quality(
     settings = stacked(texts, grid)
     with usable_input():
         found = maxent.assess(settings, reward, grid.horizon)
-    # The same episodes for every method; no dataset has a seed this long.
+    # The same episodes for every reward; a third number keeps them apart from every dataset.
     groups = [sample(t, grid, held_out, (0, e, held_out)) for e, t in enumerate(texts)]
     demos = indexed(settings, groups, grid)
     solution = maxent.solve(settings, reward, grid.horizon)
