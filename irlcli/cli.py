@@ -581,16 +581,35 @@ def name(
         out.print_data(str(artefact.directory))
 
 
-@command("report", runs=False)
+@command("report")
 def report(
     session: Session,
-    kind: Annotated[str, typer.Argument(help="returns")],
-    refs: Annotated[list[str], typer.Argument(help="Evaluations.")],
+    kind: Annotated[str, typer.Argument(help="returns or figure2.")],
+    refs: Annotated[list[str] | None, typer.Argument(help="Evaluations, for returns.")] = None,
+    name: Name = None,
 ) -> None:
-    """Tabulate results: ``irl report returns REF...`` puts true returns side by side."""
-    if kind != "returns":
-        raise UsageError(f"unknown report {kind!r}", "known: returns")
-    _print_returns(session, refs)
+    """Put results side by side: ``irl report returns REF...``, ``irl report figure2``."""
+    if kind == "returns":
+        if not refs:
+            raise UsageError("no evaluation is named", "write irl report returns REF...")
+        _print_returns(session, refs)
+    elif kind == "figure2":
+        if refs:
+            raise UsageError("figure2 takes no references", "its seeds are --set figure2.seeds=20")
+        _report_figure2(session, name)
+    else:
+        raise UsageError(f"unknown report {kind!r}", "known: returns, figure2")
+
+
+def _report_figure2(session: Session, name: str | None) -> None:
+    from irlcli.stages import figure2
+
+    config = session.settings("gridworld")
+    settings = _settings("gridworld", config, "path-group", "id")
+    request = figure2.request("gridworld", settings, _unseen("gridworld", config), config)
+    artefacts = session.deliver([request], name)
+    if artefacts and not session.as_json:
+        print(session.store.open(artefacts[0], "figure2.md").read_text(), file=sys.stderr, end="")
 
 
 def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) -> None:
