@@ -150,7 +150,7 @@ class MaxEntSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Figure2Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Paper Fig. 2 as numbers: ``seeds`` datasets, and the lambdas of the sweep.
+    """Paper Fig. 2 as numbers: ``seeds`` datasets, the lambdas of IRM, the L2 weights of ERM.
 
     The datasets' seeds begin at 1000: smaller ones are for trying things out.
     """
@@ -158,7 +158,8 @@ class Figure2Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     seeds: Annotated[int, Meta(ge=2)] = 20
     first_seed: NonNegativeCount = 1000
     episodes: tuple[Count, ...] = (400, 25, 3)
-    penalty_weights: tuple[NonNegative, ...] = (0.001, 0.01, 0.05, 0.2, 1.0)
+    penalty_weights: tuple[NonNegative, ...] = (0.01, 0.05, 0.2, 1.0)
+    l2s: tuple[NonNegative, ...] = (1e-3, 1e-2, 1e-1, 1.0)
 
 
 class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
 
 MEASURES = (
     "goal_probability",
@@ -90,6 +91,21 @@ def table(found: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[l
     return ["method", *(w[0] for w in wanted)], rows
 
 
+def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:
+    """(weight, variant) along each sweep, from weight 0: IRM by penalty, and the L2 of ERM."""
+    rows = quality.drop_duplicates("variant")
+    irm = rows[(rows["method"] == "irm") & ~rows["shuffled"]]
+    found = {
+        f"IRM {penalty}": [
+            (0.0, "erm-balanced"),
+            *zip(group["penalty_weight"], group["variant"], strict=True),
+        ]
+        for penalty, group in irm.groupby("penalty", sort=False)
+    }
+    erm = rows[rows["method"] == "erm"]
+    return {**found, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
+
+
 def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
@@ -127,24 +143,33 @@ def draw(
     maze: Maze,
     panels: Sequence[Panel],
     found: pd.DataFrame,
-    curves: Mapping[str, Sequence[tuple[float, str]]],
+    lines: Mapping[str, Sequence[tuple[float, str]]],
+    seed: int,
 ) -> None:
     """Write ``figure2.png`` and ``figure2.pdf``.
 
     Args:
         panels: seven, beside the experts' paths.
         found: as :func:`summary` returns it.
-        curves: for each penalty its (lambda, variant), the first of lambda 0.
+        lines: as :func:`curves` returns them.
+        seed: the dataset that the panels show.
     """
+    caption = (
+        f"Dataset {seed}, not chosen for its looks. (b)-(h): the recovered reward of each cell, on "
+        "its own colour scale. White crosses: the bars of the unseen mazes\n(blocked=1 the left "
+        "one, blocked=2 both). Orange: where the reward's optimal policy goes in blocked=1 (solid) "
+        "and blocked=2 (dotted) if no move slips; a dot where it ends."
+    )
     with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
-        figure = plt.figure(figsize=(15, 15.5), layout="constrained")
-        grid = figure.add_gridspec(4, 1, height_ratios=[4, 4, 3.4, 3.4], hspace=0.03)
+        figure = plt.figure(figsize=(15, 16), layout="constrained")
+        figure.suptitle(caption, fontsize=10)
+        grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 5])
         tops = [grid[i].subgridspec(1, 4) for i in range(2)]
         axes = [figure.add_subplot(tops[k // 4][k % 4]) for k in range(8)]
         _draw_experts(axes[0], maze)
         for k, (axis, panel) in enumerate(zip(axes[1:], panels, strict=True)):
             _draw_reward(figure, axis, maze, panel, chr(ord("b") + k))
-        _draw_curves(figure, grid[2].subgridspec(1, 3), found, curves, list(maze.bars))
+        _draw_curves(figure, grid[2].subgridspec(1, 3), found, lines, list(maze.bars))
         _draw_table(figure.add_subplot(grid[3]), found, list(maze.bars))
         figure.savefig(directory / "figure2.png", dpi=130)
         figure.savefig(directory / "figure2.pdf", metadata={"CreationDate": None})
@@ -163,7 +188,12 @@ def _cells(axis, wall: np.ndarray, size: int, **style) -> None:
 def _ends(axis, size: int, colour: str) -> None:
     for position, text in ((0, "S"), (size - 1, "G")):
         axis.text(
-            position, position, text, ha="center", va="center", color=colour, weight="bold", size=11
+            *(position, position, text),
+            **{"ha": "center", "va": "center", "size": 12, "weight": "bold", "color": colour},
+            path_effects=[
+                withStroke(linewidth=2.5, foreground="black" if colour == "white" else "white")
+            ],
+            zorder=5,
         )
 
 
@@ -203,25 +233,22 @@ def _draw_reward(figure, axis, maze: Maze, panel: Panel, letter: str) -> None:
     axis.set_title(f"({letter}) {panel.title}")
 
 
-def _draw_curves(figure, places, found, curves, unseen: Sequence[str]) -> None:
+def _draw_curves(figure, places, found, lines, unseen: Sequence[str]) -> None:
     cells = found.set_index(["variant", "measure", "setting"])
     what = [(f"goal probability, {u} (unseen)", "goal_probability", u) for u in unseen[:2]]
     what.append(("log-likelihood, worst trained setting [nats]", "log_likelihood", "worst"))
     for k, (title, measure, setting) in enumerate(what):
         axis = figure.add_subplot(places[k])
-        ends = []
-        for colour, marker, (penalty, points) in zip(
-            GROUP_COLOURS, "os", curves.items(), strict=False
+        for colour, marker, (label, points) in zip(
+            GROUP_COLOURS, "os^", lines.items(), strict=False
         ):
-            x = np.arange(len(points))
+            weights = [weight for weight, _ in points]
             rows = cells.loc[[(variant, measure, setting) for _, variant in points]]
-            axis.fill_between(x, rows["low"], rows["high"], color=colour, alpha=0.2, lw=0)
-            axis.plot(x, rows["mean"], marker=marker, color=colour, label=penalty)
-            ends = [f"{weight:g}" for weight, _ in points]
-        erm = cells.loc[("erm", measure, setting)]
-        axis.axhline(erm["mean"], color="black", ls="--", lw=1, label="ERM")
-        axis.set_xticks(np.arange(len(ends)), ends)
-        axis.set(title=title, xlabel="$\\lambda$ (0 is ERM-balanced)")
+            axis.fill_between(weights, rows["low"], rows["high"], color=colour, alpha=0.2, lw=0)
+            axis.plot(weights, rows["mean"], marker=marker, color=colour, label=label)
+        axis.set_xscale("symlog", linthresh=1e-3)
+        axis.set_xlim(left=-1e-4)
+        axis.set(title=title, xlabel="$\\lambda$ of IRM (0: ERM-balanced), or L2 of ERM (0: ERM)")
         axis.grid(alpha=0.3)
         if k == 0:
             axis.legend(fontsize=8)
@@ -231,18 +258,20 @@ def _draw_table(axis, found: pd.DataFrame, unseen: Sequence[str]) -> None:
     columns, rows = table(found, unseen)
     keep = [i for i, c in enumerate(columns) if not c.startswith("value difference")]
     axis.axis("off")
-    heads = [columns[i].replace(", ", ",\n") for i in keep]
-    body = [[row[i] for i in keep] for row in rows]
     drawn = axis.table(
-        [heads, *body], loc="center", cellLoc="center", bbox=[0, 0, 1, 1], edges="horizontal"
+        [[columns[i].replace(", ", ",\n") for i in keep]]
+        + [[row[i] for i in keep] for row in rows],
+        colWidths=[0.16] + [0.84 / (len(keep) - 1)] * (len(keep) - 1),
+        cellLoc="center",
+        bbox=[0, 0, 1, 1],
+        edges="horizontal",
     )
     drawn.auto_set_font_size(False)
-    drawn.set_fontsize(8.5)
+    drawn.set_fontsize(9)
     for (row, column), cell in drawn.get_celld().items():
-        cell.set_height(2.0 if row == 0 else 1.0)
         cell.set_linewidth(0.4)
         if column == 0:
-            cell.set_width(1.35)
             cell.set_text_props(ha="left")
         if row == 0:
-            cell.set_text_props(weight="bold")
+            cell.set_height(1.8 * cell.get_height())
+            cell.set_text_props(weight="bold", size=8)

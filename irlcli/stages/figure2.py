@@ -16,7 +16,6 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seed: int
-    penalty_weights: tuple[float, ...]
 
 
 def request(
@@ -34,7 +33,6 @@ def request(
         settings=sweep.parameters.settings,
         unseen=sweep.parameters.unseen,
         seed=drawn.parameters.seed,
-        penalty_weights=sweep.parameters.penalty_weights,
     )
     inputs = {"sweep": From(sweep), "demonstrations": From(drawn)}
     return Request(STAGE, parameters, inputs, f"figure2 {env}")
@@ -55,7 +53,8 @@ def run(job: Job) -> None:
     grid, dataset = gridworlds.read(job.inputs["demonstrations"], p.env, p.settings)
     rewards = pd.read_parquet(job.inputs["sweep"] / "rewards.parquet")
     rewards = rewards[rewards["seed"] == p.seed].set_index("variant")["reward"]
-    found = figure2.summary(pd.read_parquet(job.inputs["sweep"] / "quality.parquet"))
+    quality = pd.read_parquet(job.inputs["sweep"] / "quality.parquet")
+    found = figure2.summary(quality)
     seen, unseen = (gridworlds.stacked(texts, grid) for texts in (p.settings, p.unseen))
     demos = gridworlds.indexed(seen, list(dataset.trajectories.values()), grid)
 
@@ -90,18 +89,9 @@ def run(job: Job) -> None:
         for kind in sweep_maxent.PENALTIES
         for weight in sweep_maxent.PAPER_PENALTY_WEIGHTS
     ]
-    curves = {
-        kind: [(0.0, "erm-balanced")]
-        + [
-            (v.penalty_weight, str(v))
-            for v in sweep_maxent.variants(p.penalty_weights)
-            if v.method == "irm" and v.penalty == kind and not v.shuffled
-        ]
-        for kind in sweep_maxent.PENALTIES
-    }
     paths = dict(zip(p.settings, demos.states, strict=True))
     maze = figure2.Maze(grid.size, paths, wall(p.settings), wall(p.unseen))
-    figure2.draw(job.output, maze, panels, found, curves)
+    figure2.draw(job.output, maze, panels, found, figure2.curves(quality), p.seed)
     found.to_csv(job.output / "figure2.csv", index=False, float_format="%.6g", lineterminator="\n")
     text = figure2.markdown(*figure2.table(found, p.unseen))
     (job.output / "figure2.md").write_text(text)

@@ -71,7 +71,9 @@ def sample(
     return gridworld.sample_trajectories(world, grid.size, policy, episodes, seed)
 
 
-def read(directory: Path, env: str, texts: Sequence[str]) -> tuple[GridworldSettings, Demonstrations]:
+def read(
+    directory: Path, env: str, texts: Sequence[str]
+) -> tuple[GridworldSettings, Demonstrations]:
     """The gridworld demonstrations in ``directory`` and the grid that they are of.
 
     Raises:

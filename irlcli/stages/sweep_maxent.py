@@ -21,6 +21,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     unseen: tuple[str, ...]
     seeds: tuple[int, ...]
     penalty_weights: tuple[float, ...]
+    l2s: tuple[float, ...]
     gridworld: GridworldSettings
     maxent: MaxEntSettings
 
@@ -50,15 +51,15 @@ PAPER_L2 = 1e-3
 PAPER_PENALTY_WEIGHTS = (0.01, 0.05)
 
 
-def variants(penalty_weights: Sequence[float]) -> Iterator[Variant]:
+def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> Iterator[Variant]:
     """The baselines, then for each penalty its lambdas and the paper's with shuffled labels.
 
     IRM with lambda 0 is ERM-balanced, which therefore stands at the low end of every sweep.
     """
     yield Variant("erm", PENALTIES[0], 0.0, 0.0, False)
-    yield Variant("erm", PENALTIES[0], 0.0, PAPER_L2, False)
+    for l2 in sorted({*l2s, PAPER_L2} - {0.0}):
+        yield Variant("erm", PENALTIES[0], 0.0, l2, False)
     yield Variant("erm-balanced", PENALTIES[0], 0.0, 0.0, False)
-    yield Variant("erm-balanced", PENALTIES[0], 0.0, PAPER_L2, False)
     for penalty in PENALTIES:
         for weight in sorted({*penalty_weights, *PAPER_PENALTY_WEIGHTS} - {0.0}):
             yield Variant("irm", penalty, weight, 0.0, False)
@@ -95,6 +96,7 @@ def request(
         unseen=tuple(str(s) for s in unseen),
         seeds=tuple(r.parameters.seed for r in requests),
         penalty_weights=config.figure2.penalty_weights,
+        l2s=config.figure2.l2s,
         gridworld=config.gridworld,
         maxent=config.maxent,
     )
@@ -116,7 +118,7 @@ def run(job: Job) -> None:
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
-    grid, m = p.gridworld, p.maxent
+    grid = p.gridworld
     settings = gridworlds.stacked(p.settings, grid)
     occupancy: dict[bool, list[Any]] = {False: [], True: []}
     for seed in p.seeds:
@@ -128,45 +130,23 @@ def run(job: Job) -> None:
             if shuffled:
                 demos = maxent.shuffle_settings(demos, seed)
             occupancy[shuffled].append(maxent.expert_occupancy(settings, demos, grid.horizon))
-    found = list(variants(p.penalty_weights))
+    found = list(variants(p.penalty_weights, p.l2s))
     saved = job.checkpoints.load()
-    saved = None if saved is None else checkpoints.from_bytes(saved)
-    rewards = [] if saved is None else [tensor.numpy() for tensor in saved["rewards"]]
-    state = None if saved is None else saved["fit"]
-    for k, penalty in enumerate(PENALTIES):
+    state = None if saved is None else checkpoints.from_bytes(saved)
+    rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
+    while len(rewards) < len(PENALTIES):
+        penalty = PENALTIES[len(rewards)]
         chosen = [v for v in found if v.penalty == penalty]
-        if k < len(rewards):
-            continue
-
-        def after_record(done, state, k=k):
-            total = m.iterations * len(PENALTIES)
-            job.console.progress(k * m.iterations + done, total, "iterations", {})
-            job.checkpoints.offer(
-                lambda: checkpoints.to_bytes(
-                    {"rewards": [torch.as_tensor(r) for r in rewards], "fit": state()}
-                )
-            )
-
-        def each(values, copies=len(p.seeds)):
-            return np.repeat(np.array(values), copies, axis=0)
-
-        with gridworlds.usable_input():
-            fit = maxent.fit(
-                settings,
-                gridworlds.inputs(m.inputs, grid),
-                np.concatenate([occupancy[v.shuffled] for v in chosen]),
-                each([maxent.setting_weights(v.method, counts) for v in chosen]),
-                each([v.penalty_weight for v in chosen]),
-                each([v.l2 for v in chosen]),
-                list(p.seeds) * len(chosen),
-                penalty_kind=penalty,
-                horizon=grid.horizon,
-                hidden=m.hidden if m.features == "learned" else 0,
-                iterations=m.iterations,
-                learning_rate=m.learning_rate,
-                state=state,
-                after_record=after_record,
-            )
+        fit = _fit(
+            job,
+            settings,
+            [seed for _ in chosen for seed in p.seeds],
+            [v for v in chosen for _ in p.seeds],
+            np.concatenate([occupancy[v.shuffled] for v in chosen]),
+            counts,
+            rewards,
+            None if state is None else state["fit"],
+        )
         rewards.append(fit.reward)
         state = None
     runs = [(v, seed) for kind in PENALTIES for v in found if v.penalty == kind for seed in p.seeds]
@@ -178,7 +158,7 @@ def run(job: Job) -> None:
     write_table(pa.Table.from_pylist(rows), job.output / "rewards.parquet")
     rows = []
     for texts, seen in ((p.settings, True), (p.unseen, False)):
-        measures = gridworlds.quality(texts, grid, reward, m.held_out) if texts else {}
+        measures = gridworlds.quality(texts, grid, reward, p.maxent.held_out) if texts else {}
         rows += [
             {
                 "variant": str(v),
@@ -192,6 +172,46 @@ def run(job: Job) -> None:
             for e, text in enumerate(texts)
         ]
     write_table(pa.Table.from_pylist(rows), job.output / "quality.parquet")
+
+
+def _fit(job, settings, seeds, runs, occupancy, counts, rewards, state):
+    """Fit one reward for each of ``runs`` (variants), all of one penalty; ``rewards`` are done."""
+    import numpy as np
+    import torch
+
+    from irlcli import checkpoints
+    from irlcli.irl import maxent
+    from irlcli.stages import gridworlds
+
+    p: Parameters = job.parameters
+    m = p.maxent
+
+    def after_record(done, state):
+        total = m.iterations * len(PENALTIES)
+        job.console.progress(m.iterations * len(rewards) + done, total, "iterations", {})
+        job.checkpoints.offer(
+            lambda: checkpoints.to_bytes(
+                {"rewards": [torch.as_tensor(r) for r in rewards], "fit": state()}
+            )
+        )
+
+    with gridworlds.usable_input():
+        return maxent.fit(
+            settings,
+            gridworlds.inputs(m.inputs, p.gridworld),
+            occupancy,
+            np.stack([maxent.setting_weights(v.method, counts) for v in runs]),
+            np.array([v.penalty_weight for v in runs]),
+            np.array([v.l2 for v in runs]),
+            seeds,
+            penalty_kind=runs[0].penalty,
+            horizon=p.gridworld.horizon,
+            hidden=m.hidden if m.features == "learned" else 0,
+            iterations=m.iterations,
+            learning_rate=m.learning_rate,
+            state=state,
+            after_record=after_record,
+        )
 
 
 STAGE = Stage("sweep-maxent", 1, run)
