@@ -222,7 +222,7 @@ class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
         ValueError: as :func:`gridworld`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["ansi"], "render_fps": 4}
+    metadata: ClassVar = {"render_modes": ["ansi"], "render_fps": 4}
 
     def __init__(
         self,
