@@ -163,7 +163,7 @@ def draw(
     with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
         figure = plt.figure(figsize=(15, 16), layout="constrained")
         figure.suptitle(caption, fontsize=10)
-        grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 5])
+        grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 5.4])
         tops = [grid[i].subgridspec(1, 4) for i in range(2)]
         axes = [figure.add_subplot(tops[k // 4][k % 4]) for k in range(8)]
         _draw_experts(axes[0], maze)
@@ -250,6 +250,8 @@ def _draw_curves(figure, places, found, lines, unseen: Sequence[str]) -> None:
         axis.set_xlim(left=-1e-4)
         axis.set(title=title, xlabel="$\\lambda$ of IRM (0: ERM-balanced), or L2 of ERM (0: ERM)")
         axis.grid(alpha=0.3)
+        if measure == "goal_probability":
+            axis.set_ylim(-0.03, 1.03)
         if k == 0:
             axis.legend(fontsize=8)
 
