@@ -39,7 +39,7 @@ def from_bytes(data: bytes) -> Any:
 
 
 def save(path: Path, kind: str, description: dict[str, Any], state: dict[str, Any]) -> None:
-    """Write a tensor file of ``kind`` (``reward`` or ``policy``) that describes itself."""
+    """Write a tensor file of ``kind`` (``reward``, ``tabular-reward`` or ``policy``) that describes itself."""
     text = json.dumps(description, sort_keys=True, allow_nan=False)
     path.write_bytes(
         to_bytes({"kind": kind, "schema": SCHEMA, "description": text, "state": state})

@@ -19,6 +19,7 @@ from irlcli.settings import GridworldSettings
 from irlcli.trajectories import Trajectory
 
 ENV = "gridworld"
+_ACTIONS = 4
 
 
 @contextmanager
@@ -36,9 +37,16 @@ def mdp(text: str, grid: GridworldSettings) -> tabular.TabularMDP:
     """The MDP of setting ``text``.
 
     Raises:
-        UsageError: no such setting, or its goal cannot be reached.
+        UsageError: no such setting, or a goal that cannot be reached, at all or within the
+            horizon; a grid too large to solve.
     """
+    # Before anything of that size is built.
     with usable_input():
+        tabular.check_size(grid.horizon, 1.0, _ACTIONS * grid.size**2)
+        if grid.horizon < 2 * (grid.size - 1):
+            raise ValueError(
+                f"the goal is {2 * (grid.size - 1)} steps away, the horizon only {grid.horizon}"
+            )
         return gridworld.gridworld(
             grid.size,
             goal=grid.goal,
@@ -62,7 +70,7 @@ def sample(
     """``episodes`` trajectories of the expert of setting ``text``, by value iteration.
 
     Raises:
-        UsageError: as :func:`mdp`; a horizon shorter than the path; a grid too large.
+        UsageError: as :func:`mdp`.
     """
     world = mdp(text, grid)
     with usable_input():
