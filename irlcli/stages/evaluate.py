@@ -56,9 +56,11 @@ def run(job: Job) -> None:
     from irlcli.stages.outputs import write_json
 
     p: Parameters = job.parameters
-    policy, origin = p.agent, {"agent": p.agent, "env": p.env}
+    policy, subject = p.agent, {"agent": p.agent, "env": p.env}
     if "policy" in job.inputs:
         policy, origin = load_policy_file(job.inputs["policy"])
+        subject = msgspec.to_builtins(origin)
+        del subject["network"]
     rows, summary = [], []
     for index, text in enumerate(p.settings):
         seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
@@ -96,7 +98,6 @@ def run(job: Job) -> None:
             index + 1, len(p.settings), "settings", {text: f"return {returns.mean():.0f}"}
         )
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
-    subject = {key: value for key, value in origin.items() if key not in ("network", "airl")}
     write_json(job.output / "summary.json", {"policy": subject, "settings": summary})
 
 

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow as pa
 
-from irlcli import checkpoints
+from irlcli import checkpoints, descriptions
 from irlcli.dataset import write_table
 from irlcli.rl import Policy
 from irlcli.settings import PPOSettings
@@ -26,9 +27,13 @@ def write_metrics(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_policy(
-    directory: Path, policy: Policy, ppo: PPOSettings, description: Mapping[str, Any]
+    directory: Path, policy: Policy, ppo: PPOSettings, env: str, **origin: Any
 ) -> None:
-    """Write ``policy.pt`` and, for readers without torch, its description ``policy.json``."""
-    full = {**description, "network": Policy.describe(description["env"], ppo)}
-    checkpoints.save(directory / "policy.pt", "policy", full, policy.state_dict())
-    write_json(directory / "policy.json", full)
+    """Write ``policy.pt`` and, for readers without torch, its description ``policy.json``.
+
+    ``origin`` are the fields of ``descriptions.Policy`` besides the environment and the network.
+    """
+    network = Policy.describe(env, ppo)
+    description = descriptions.Policy(env=env, network=network, **origin)
+    checkpoints.save(directory / "policy.pt", "policy", description, policy.state_dict())
+    write_json(directory / "policy.json", msgspec.to_builtins(description))

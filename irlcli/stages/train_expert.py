@@ -44,9 +44,16 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     worlds = rl.make_worlds(p.env, [parse_setting(p.env, p.setting)], p.ppo.n_envs)
     trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed)
-    description = {"agent": "expert", "env": p.env, "settings": [p.setting], "seed": p.seed}
     rows = train_rounds(job, trainer, [p.setting])
-    write_policy(job.output, trainer.policy, p.ppo, description)
+    write_policy(
+        job.output,
+        trainer.policy,
+        p.ppo,
+        p.env,
+        agent="expert",
+        settings=(p.setting,),
+        seed=p.seed,
+    )
     write_metrics(job.output, rows)
 
 

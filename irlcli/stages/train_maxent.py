@@ -50,7 +50,7 @@ def run(job: Job) -> None:
     import numpy as np
     import torch
 
-    from irlcli import checkpoints
+    from irlcli import checkpoints, descriptions
     from irlcli.irl import maxent
     from irlcli.stages import gridworlds
     from irlcli.stages.outputs import write_json, write_metrics
@@ -84,17 +84,12 @@ def run(job: Job) -> None:
             state=None if saved is None else checkpoints.from_bytes(saved),
             after_record=after_record,
         )
-    description = {
-        "env": p.env,
-        "settings": list(p.settings),
-        "method": m.method,
-        "seed": p.seed,
-        "gridworld": msgspec.to_builtins(grid),
-        "maxent": msgspec.to_builtins(m),
-    }
+    description = descriptions.TabularReward(
+        env=p.env, settings=p.settings, method=m.method, seed=p.seed, gridworld=grid, maxent=m
+    )
     tensors = {"reward": torch.as_tensor(fit.reward[0]), **fit.networks.state_dict()}
     checkpoints.save(job.output / "reward.pt", "tabular-reward", description, tensors)
-    write_json(job.output / "reward.json", description)
+    write_json(job.output / "reward.json", msgspec.to_builtins(description))
     write_metrics(
         job.output,
         [
@@ -118,7 +113,7 @@ def run(job: Job) -> None:
             {"setting": text, "seen": seen, **{k: _number(a[0, e]) for k, a in found.items()}}
             for e, text in enumerate(texts)
         ]
-    write_json(job.output / "quality.json", {"policy": description, "settings": rows})
+    write_json(job.output / "quality.json", {"settings": rows})
 
 
 def _number(x: float) -> float | None:
