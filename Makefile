@@ -57,19 +57,18 @@ table1-lunar-lander: row-bounce row-engine-power
 # Every method on 20 gridworld datasets: the picture, the table, and how they came about.
 # SET="--set gridworld.goal=terminal" and the like make other cases, RESULTS says where they go.
 RESULTS ?= docs/results/figure2
-FIGURE2  = report figure2 --profile $(PROFILE) $(SET)
+FIGURE2   = $(strip report figure2 --profile $(PROFILE) $(SET))
+MADE_AT   = import json, sys; a = json.load(sys.stdin); print(a["path"], a["provenance"]["git"]["commit"])
 figure2: $(READY)
 	$(RUN) $(IRL) $(FIGURE2) --store $(STORE) --name $(TAG).$(@F)
 	@mkdir -p $(RESULTS)
-	@from=$(STORE)/$$($(IRL) show --json --store $(STORE) $(TAG).$(@F) \
-	    | $(VENV)/bin/python -c 'import json, sys; print(json.load(sys.stdin)["id"][:16])') && \
-	  install -m 644 $$from/figure2.png $$from/figure2.pdf $$from/figure2.csv $(RESULTS) && \
-	  { echo '# Figure 2'; echo; \
-	    echo "\`irl $(FIGURE2)\` at commit $$(git describe --always --dirty)."; echo; \
+	@set -e; set -- $$($(IRL) show --json --store $(STORE) $(TAG).$(@F) \
+	    | $(VENV)/bin/python -c '$(MADE_AT)'); \
+	  install -m 644 $$1/figure2.png $$1/figure2.pdf $$1/figure2.csv $(RESULTS); \
+	  { echo '# Figure 2'; echo; echo "\`irl $(FIGURE2)\`, made at commit $$2."; echo; \
 	    echo 'Mean over datasets, and the bootstrap 95 % interval. *Worst trained*: the worst of the'; \
 	    echo 'three settings trained on, in each dataset.'; echo; \
-	    cat $$from/figure2.md; } > $(RESULTS)/README.md
-	@echo $(RESULTS)
+	    cat $$1/figure2.md; } > $(RESULTS)/README.md
 
 # A row of the table: experts -> demonstrations -> AIRL per method and seed -> transfer -> returns.
 # The held-out values stand in settings/lunar-lander.toml.
