@@ -30,7 +30,10 @@ from irlcli.store import (
 )
 
 CHECKPOINT_SECONDS = 10.0
-_LIBRARIES = ("torch", "numpy", "stable-baselines3", "gymnasium", "Box2D", "pyarrow", "msgspec")
+_LIBRARIES = (
+    *("torch", "numpy", "scipy", "stable-baselines3", "gymnasium", "Box2D", "pyarrow", "msgspec"),
+    "matplotlib",
+)
 
 Status = Literal["HIT", "RUN", "RESUME", "BLOCKED"]
 
