@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "irlcli"
-HEAVY = {"torch", "stable_baselines3", "gymnasium", "pybullet", "pandas", "pyarrow", "Box2D"}
+HEAVY = {
+    *("torch", "stable_baselines3", "gymnasium", "pybullet", "pandas", "pyarrow", "Box2D"),
+    *("scipy", "matplotlib"),
+}
 OURS = {
     "store",
     "stages",
@@ -30,7 +33,7 @@ NEVER = {
     "settings": HEAVY | OURS | {"numpy"},
     "interventions": HEAVY | OURS | {"numpy", "settings"},
     "trajectories": HEAVY | OURS | {"settings", "pathlib"},
-    "tabular": HEAVY | OURS | {"settings", "pathlib"},
+    "tabular": (HEAVY - {"scipy"}) | OURS | {"settings", "pathlib"},
     "store": HEAVY | (OURS - {"store"}) | {"numpy", "msgspec", "settings", "trajectories"},
     "envs": {"torch", "stable_baselines3", "pandas", "pyarrow"} | (OURS - {"envs"}),
     "irl": {"stable_baselines3", "gymnasium", "pandas", "pyarrow", "logging", "pathlib"}
@@ -56,6 +59,9 @@ LIGHT = [
     "stages/train_expert",
     "stages/collect_experts",
     "stages/train_airl",
+    "stages/train_maxent",
+    "stages/sweep_maxent",
+    "stages/figure2",
     "stages/transfer",
     "stages/evaluate",
 ]

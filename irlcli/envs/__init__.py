@@ -12,6 +12,7 @@ from irlcli.interventions import ENVIRONMENTS, Setting, env_kwargs, environment
 
 _ENTRY_POINTS = {
     "lunar-lander": "irlcli.envs.lunar_lander:LunarLander",
+    "gridworld": "irlcli.envs.gridworld:Gridworld",
 }
 
 for _name, _entry_point in _ENTRY_POINTS.items():

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import msgspec
 
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.interventions import Setting, parse_setting
+from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.settings import AIRLSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
@@ -32,8 +32,9 @@ def request(
     ``metrics.parquet`` with one row per round and setting.
 
     Raises:
-        UsageError: the worlds cannot be shared equally by the settings.
+        UsageError: a tabular environment, or the worlds cannot be shared equally by the settings.
     """
+    check_tabular(env, "train-airl", wanted=False)
     texts = tuple(str(s) for s in settings_)
     if airl.ppo.n_envs % len(texts):
         raise UsageError(
