@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError, suggest
+from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError, closest, suggest
 from irlcli.store.digest import file_digest
 from irlcli.store.lock import is_locked, locked
 from irlcli.store.manifest import (
@@ -215,15 +215,18 @@ class Store:
         Raises:
             IntegrityError: the manifest is damaged; the artefact has been moved to quarantine.
         """
-        directory = self.root / id16
         try:
-            manifest = read_manifest(directory)
+            return self._read(id16)
         except NewerFormat:
             raise
         except IntegrityError as error:
-            raise self._damaged(directory, error.message) from None
+            raise self._damaged(self.root / id16, error.message) from None
+
+    def _read(self, id16: str) -> Artefact:
+        directory = self.root / id16
+        manifest = read_manifest(directory)
         if manifest.id[:_ID_DIGITS] != id16:
-            raise self._damaged(directory, "its manifest does not match its address")
+            raise IntegrityError(f"{directory / MANIFEST} does not match its address")
         return Artefact(directory, manifest)
 
     def open(self, artefact: Artefact, path: str) -> Path:
@@ -284,11 +287,10 @@ class Store:
         if artefact is None:
             if not inside and os.path.exists(ref):
                 return Resolved(None, Path(ref))
-            known = [*self.names(), *self.ids()]
             hint = "`irl ls` lists the artefacts"
-            close = suggest(head, known) if known else ""
-            if close.startswith("did you mean"):
-                hint = close.split(";")[0] + "; " + hint
+            close = closest(head, self.names())
+            if close is not None:
+                hint = f"did you mean {close!r}? {hint}"
             raise NotFound(f"{ref!r} names no artefact and no file", hint)
         if not rest:
             return Resolved(artefact, artefact.directory)
@@ -442,15 +444,12 @@ class Store:
         Raises:
             NewerFormat: a newer version made it; nothing can be said of it.
         """
-        directory = self.root / id16
         try:
-            manifest = read_manifest(directory)
+            directory, manifest = self._read(id16)
         except NewerFormat:
             raise
         except IntegrityError as error:
             return [error.message]
-        if manifest.id[:_ID_DIGITS] != id16:
-            return [f"{directory / MANIFEST} does not match its address"]
         found = [
             problem
             for output in manifest.outputs
