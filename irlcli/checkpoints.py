@@ -14,6 +14,7 @@ import pickle
 import pickletools
 import stat
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,17 @@ def from_bytes(data: bytes) -> Any:
     except Exception as error:
         # Whatever a crafted archive makes zipfile, pickle or torch raise.
         raise ValueError((str(error) or type(error).__name__).splitlines()[0][:200]) from None
+
+
+def restore(data: bytes | None, warn: Callable[[str], None]) -> Any:
+    """The state in a stage's checkpoint; None, and a warning, for one that cannot be used."""
+    if data is None:
+        return None
+    try:
+        return from_bytes(data)
+    except ValueError as error:
+        warn(f"the checkpoint cannot be used ({error}): starting over")
+        return None
 
 
 def _check_globals(data: bytes) -> None:

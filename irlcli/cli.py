@@ -600,7 +600,9 @@ def report(
     """Put results side by side: ``irl report returns REF...``, ``irl report figure2``."""
     if kind == "returns":
         if not refs:
-            raise UsageError("no evaluation is named: refs are missing", "irl report returns REF...")
+            raise UsageError(
+                "no evaluation is named: refs are missing", "irl report returns REF..."
+            )
         _print_returns(session, refs)
     elif kind == "figure2":
         if refs:

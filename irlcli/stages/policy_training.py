@@ -32,7 +32,7 @@ def train_rounds(
     first, rows = 0, []
     if adversary is not None:
         reward = adversary.reward
-    state = _restored(job)
+    state = checkpoints.restore(job.checkpoints.load(), job.console.warn)
     if state is not None:
         trainer.load_state_dict(state["trainer"])
         if adversary is not None:
@@ -50,17 +50,6 @@ def train_rounds(
         _report(job, trainer, newest)
         job.checkpoints.offer(partial(_state, trainer, adversary, index + 1, rows))
     return rows
-
-
-def _restored(job: Job) -> dict[str, Any] | None:
-    stored = job.checkpoints.load()
-    if stored is None:
-        return None
-    try:
-        return checkpoints.from_bytes(stored)
-    except ValueError as error:
-        job.console.warn(f"the checkpoint cannot be used ({error}): starting over")
-        return None
 
 
 def _state(

@@ -131,8 +131,7 @@ def run(job: Job) -> None:
                 demos = maxent.shuffle_settings(demos, seed)
             occupancy[shuffled].append(maxent.expert_occupancy(settings, demos, grid.horizon))
     found = list(variants(p.penalty_weights, p.l2s))
-    saved = job.checkpoints.load()
-    state = None if saved is None else checkpoints.from_bytes(saved)
+    state = checkpoints.restore(job.checkpoints.load(), job.console.warn)
     rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
     while len(rewards) < len(PENALTIES):
         penalty = PENALTIES[len(rewards)]

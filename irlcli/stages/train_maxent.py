@@ -66,7 +66,6 @@ def run(job: Job) -> None:
         job.console.progress(done, m.iterations, "iterations", {})
         job.checkpoints.offer(lambda: checkpoints.to_bytes(state()))
 
-    saved = job.checkpoints.load()
     with gridworlds.usable_input():
         fit = maxent.fit(
             settings,
@@ -81,7 +80,7 @@ def run(job: Job) -> None:
             hidden=m.hidden if m.features == "learned" else 0,
             iterations=m.iterations,
             learning_rate=m.learning_rate,
-            state=None if saved is None else checkpoints.from_bytes(saved),
+            state=checkpoints.restore(job.checkpoints.load(), job.console.warn),
             after_record=after_record,
         )
     description = descriptions.TabularReward(
