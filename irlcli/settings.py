@@ -8,7 +8,7 @@ variables never enter: equal settings give equal artefacts wherever they run.
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 from msgspec import Meta, Struct
@@ -341,11 +341,14 @@ def _typed(text: str, kind: Any, field: str) -> Any:
 
 
 def _field_hint(field: str) -> str:
-    """The default of a field, as an example of what it takes."""
-    value: Any = Settings()
+    """What a field takes: its choices if it has some, else its default as an example."""
+    value, kind = Settings(), Settings
     for name in field.split("."):
         name = name.partition("[")[0]
         if not isinstance(value, Struct) or not hasattr(value, name):
             return "see settings/ for examples"
+        (kind,) = (f.type for f in msgspec.structs.fields(value) if f.name == name)
         value = getattr(value, name)
+    if get_origin(kind) is Literal:
+        return f"one of: {', '.join(get_args(kind))}"
     return f"its default is {msgspec.json.encode(value).decode()}"
