@@ -16,6 +16,7 @@ import pybullet
 
 from irlcli.envs.bullet.world import (
     FROM_TO_MARGIN,
+    NOT_FINITE,
     SUBSTEPS,
     TIME_STEP,
     Capsule,
@@ -25,6 +26,7 @@ from irlcli.envs.bullet.world import (
     World,
     box_inertia,
     clipped,
+    is_finite,
     moving_joints,
     require,
     require_friction,
@@ -168,8 +170,17 @@ class Ant(gymnasium.Env):
         size = 27 + len(self._zeros) + 2 * self.goal.observed
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (8,), np.float32)
-        self._middle = _LIMITS.mean(axis=1)
-        self._tolerance = 0.99 * 0.5 * (_LIMITS[:, 1] - _LIMITS[:, 0])
+        self._middle = _LIMITS.mean(axis=1).astype(np.float32)
+        self._tolerance = (0.99 * 0.5 * (_LIMITS[:, 1] - _LIMITS[:, 0])).astype(np.float32)
+        # What each leg adds to the sum of the links' positions, hips aside: 2.5 upper
+        # segments (its middle once, its end twice) and half a lower one. A leg's direction in
+        # the torso's plane is a complex number.
+        directions = np.array([complex(x, y) for x, y, *_ in _LEGS])
+        scales = np.array([self.leg_length if y < 0 else 1.0 for _, y, *_ in _LEGS])
+        signs = np.array([sign for *_, sign in _LEGS])
+        self._upper = 2.5 * _UPPER * scales * directions
+        self._lower = 0.5 * _LOWER * scales * directions
+        self._drop = -0.5 * math.sqrt(2.0) * _LOWER * scales * signs
         self._world = World(render_mode)
 
     def reset(
@@ -197,7 +208,7 @@ class Ant(gymnasium.Env):
         if self.render_mode is not None:
             self._robot.paint((0.8, 0.5, 0.3, 1.0))
         self._robot.place(positions)
-        self._observation, _, self._potential = self._observe()
+        self._observation, self._potential = self._observe()
         return self._observation, {}
 
     def step(
@@ -210,10 +221,11 @@ class Ant(gymnasium.Env):
         """
         self._robot.drive(_TORQUE * clipped(action, 8))
         self._world.step()
-        observation, angles, potential = self._observe()
-        if not math.isfinite(potential) or not math.isfinite(observation.sum()):
-            return self._observation, 0.0, False, True, {"error": "the state is not finite"}
-        at_limit = -0.1 * int(np.count_nonzero(np.abs(angles - self._middle) > self._tolerance))
+        observation, potential = self._observe()
+        if not is_finite(observation):
+            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
+        bent = np.abs(observation[5:13] - self._middle)
+        at_limit = -0.1 * int(np.count_nonzero(bent > self._tolerance))
         progress = potential - self._potential
         self._observation = observation
         self._potential = potential
@@ -233,43 +245,85 @@ class Ant(gymnasium.Env):
         self._world.close()
 
     def _place(self) -> Robot:
-        """The robot at its start; sets the weights of its links in the mean position too."""
+        """The robot at its start."""
         client = self._world.client
         if self.model == "original":
             (body,) = self._world.load("ant.xml", pybullet.MJCF_COLORS_FROM_FILE)
             joints = moving_joints(client, body)
-            self._links = list(range(20))
-            self._weights = np.ones(20)
-            self._fixed = 0
         else:
             body = self._world.build(*morphology(self.leg_length), (0.0, 0.0, _START_HEIGHT))
             joints = list(range(8))
-            self._links = joints
-            # The original's other links, in terms of these: the four capsules fixed to the
-            # torso average to its centre, and an ankle is as far beyond the middle of the
-            # upper leg as the hip is before it.
-            self._weights = np.array([3.0, 1.0] * 4)
-            self._fixed = 4
         return Robot(client, body, joints, joints)
 
-    def _observe(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """The observation, the joint angles [8], and minus the distance to go over the step."""
+    def _observe(self) -> tuple[np.ndarray, float]:
+        """The observation, and minus the distance to the goal over the time step."""
         client, body = self._robot.client, self._robot.body
-        position, orientation = pybullet.getBasePositionAndOrientation(
+        self._position, orientation = pybullet.getBasePositionAndOrientation(
             body, physicsClientId=client
         )
         linear, angular = pybullet.getBaseVelocity(body, physicsClientId=client)
         angles, speeds = self._robot.states()
-        observation = np.array(
-            [position[2], *orientation, *angles, *linear, *angular, *speeds, *self._tail],
-            dtype=np.float32,
+        values = [
+            self._position[2],
+            *orientation,
+            *angles,
+            *linear,
+            *angular,
+            *speeds,
+            *self._tail,
+        ]
+        observation = np.fromiter(values, np.float32, len(values))
+        x, y = self._mean_position(
+            orientation,
+            linear,
+            angular,
+            np.fromiter(angles, np.float64, 8),
+            np.fromiter(speeds, np.float64, 8),
         )
-        states = pybullet.getLinkStates(body, self._links, physicsClientId=client)
-        x, y = self._weights @ np.array([state[0][:2] for state in states])
-        # Bullet's link positions, unlike the base's, are one substep old.
-        lag = self._fixed * TIME_STEP / SUBSTEPS
-        x = (x + (1 + self._fixed) * position[0] - lag * linear[0]) / _PARTS
-        y = (y + (1 + self._fixed) * position[1] - lag * linear[1]) / _PARTS
-        self._position = position
-        distance = math.hypot(self._goal[0] - x, self._goal[1] - y)
-        return observation, np.array(angles), -distance / TIME_STEP
+        return observation, -math.hypot(self._goal[0] - x, self._goal[1] - y) / TIME_STEP
+
+    def _mean_position(
+        self,
+        orientation: Sequence[float],
+        linear: Sequence[float],
+        angular: Sequence[float],
+        angles: np.ndarray,
+        speeds: np.ndarray,
+    ) -> tuple[float, float]:
+        """x and y of the mean over the original's 20 links, its torso and the floor.
+
+        The original takes the links' positions from Bullet's cache, which is one substep old,
+        but not the torso's. The four hips' positions cancel in the sum, so what is left of it
+        is the legs', in closed form: cheaper than asking Bullet.
+        """
+        lag = TIME_STEP / SUBSTEPS
+        old = angles - lag * speeds
+        hips, ankles = old[0::2], old[1::2]
+        plane = complex((self._upper + self._lower * np.cos(ankles)) @ np.exp(1j * hips))
+        height = float(self._drop @ np.sin(ankles))
+        rate = math.hypot(*angular)
+        half = 0.5 * lag * rate
+        scale = -math.sin(half) / rate if rate > 0.0 else 0.0
+        a, b, c, w = scale * angular[0], scale * angular[1], scale * angular[2], math.cos(half)
+        i, j, k, r = orientation
+        # The torso's quaternion one substep ago.
+        i, j, k, r = (
+            w * i + a * r + b * k - c * j,
+            w * j - a * k + b * r + c * i,
+            w * k + a * j - b * i + c * r,
+            w * r - a * i - b * j - c * k,
+        )
+        x = (
+            (1.0 - 2.0 * (j * j + k * k)) * plane.real
+            + 2.0 * (i * j - k * r) * plane.imag
+            + 2.0 * (i * k + j * r) * height
+        )
+        y = (
+            2.0 * (i * j + k * r) * plane.real
+            + (1.0 - 2.0 * (i * i + k * k)) * plane.imag
+            + 2.0 * (j * k - i * r) * height
+        )
+        return (
+            (21.0 * self._position[0] - 20.0 * lag * linear[0] + x) / _PARTS,
+            (21.0 * self._position[1] - 20.0 * lag * linear[1] + y) / _PARTS,
+        )

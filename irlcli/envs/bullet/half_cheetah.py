@@ -17,6 +17,7 @@ import pybullet
 
 from irlcli.envs.bullet.world import (
     FROM_TO_MARGIN,
+    NOT_FINITE,
     SUBSTEPS,
     TIME_STEP,
     Capsule,
@@ -26,6 +27,7 @@ from irlcli.envs.bullet.world import (
     World,
     box_inertia,
     clipped,
+    is_finite,
     moving_joints,
     require,
     require_friction,
@@ -251,8 +253,8 @@ class HalfCheetah(gymnasium.Env):
         self._robot.drive(_TORQUES * action)
         self._world.step()
         observation, forward = self._observe()
-        if not math.isfinite(forward) or not math.isfinite(observation.sum()):
-            return self._observation, 0.0, False, True, {"error": "the state is not finite"}
+        if not (math.isfinite(forward) and is_finite(observation)):
+            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
         progress = self._cosine * (forward - self._forward) / TIME_STEP
         control = -0.1 * float(action @ action)
         self._observation = observation
@@ -286,7 +288,8 @@ class HalfCheetah(gymnasium.Env):
     def _observe(self) -> tuple[np.ndarray, float]:
         """The observation, and how far forward the torso is."""
         positions, speeds = self._robot.states()
-        observation = np.array([*positions[1:], *speeds, *self._tail], dtype=np.float32)
+        values = [*positions[1:], *speeds, *self._tail]
+        observation = np.fromiter(values, np.float32, len(values))
         # The original reads a link's cached position, which is one substep old.
         return observation, positions[0] - speeds[0] * TIME_STEP / SUBSTEPS
 

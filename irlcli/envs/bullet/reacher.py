@@ -15,6 +15,7 @@ import pybullet
 from irlcli.envs.bullet.world import (
     FROM_TO_MARGIN,
     GRAVITY,
+    NOT_FINITE,
     TIME_STEP,
     Capsule,
     Link,
@@ -22,6 +23,7 @@ from irlcli.envs.bullet.world import (
     World,
     box_inertia,
     clipped,
+    is_finite,
     require,
     require_model,
     single,
@@ -146,8 +148,8 @@ class Reacher(gymnasium.Env):
         self._robot.drive(_TORQUE * action)
         self._world.step()
         observation, potential = self._observe()
-        if not math.isfinite(observation.sum()):
-            return self._observation, 0.0, False, True, {"error": "the state is not finite"}
+        if not is_finite(observation):
+            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
         first, second = abs(action[0]), abs(action[1])
         speeds = abs(float(observation[6])), abs(float(observation[8]))
         control = -0.1 * (first * speeds[0] + second * speeds[1]) - 0.01 * (first + second)
