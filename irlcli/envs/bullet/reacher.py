@@ -31,6 +31,7 @@ from irlcli.envs.bullet.world import (
 )
 
 _RADIUS = single(0.01)
+_BALL_RADIUS = 0.01
 _HEIGHT = single(0.01)
 _UPPER = single(0.1)
 _FINGERTIP = single(0.11)
@@ -47,12 +48,12 @@ def morphology() -> tuple[Link, list[Link]]:
     arm = Capsule((0.0, 0.0, 0.0), (_UPPER, 0.0, 0.0), _RADIUS)
     thickness = 2.0 * (_RADIUS + FROM_TO_MARGIN)
     inertia = box_inertia(arm.mass, (_UPPER + thickness, thickness, thickness))
-    ball = Capsule((_FINGERTIP, 0.0, 0.0), (_FINGERTIP, 0.0, 0.0), _RADIUS)
+    ball = Capsule((_FINGERTIP, 0.0, 0.0), (_FINGERTIP, 0.0, 0.0), _BALL_RADIUS)
     mass = arm.mass + ball.mass
     center = (arm.mass * arm.center[0] + ball.mass * _FINGERTIP) / mass
     # Parallel axes: both centres of mass lie on x, so only the moments about y and z grow.
     offset = arm.mass * (arm.center[0] - center) ** 2 + ball.mass * (_FINGERTIP - center) ** 2
-    own = 0.4 * ball.mass * _RADIUS**2
+    own = 0.4 * ball.mass * _BALL_RADIUS**2
     lower = (inertia[0] + own, inertia[1] + own + offset, inertia[2] + own + offset)
     links = [
         Link(arm.mass, inertia, (arm,), arm.center, anchor=(0.0, 0.0, _HEIGHT)),
