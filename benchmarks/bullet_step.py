@@ -9,6 +9,7 @@ uniform in the whole range, the same for every run.
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -57,7 +58,7 @@ def instructions(name: str, steps: int) -> int:
             ],
             capture_output=True,
             text=True,
-            env={"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "PYTHONPATH": ":".join(sys.path)},
+            env={**os.environ, "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"},
             check=True,
         )
     match = re.search(r"Collected : (\d+)", done.stderr)

@@ -6,6 +6,7 @@ observation entries that are always zero.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -51,12 +52,11 @@ _LEGS = (
     (-1.0, -1.0, (-1.0, 1.0, 0.0), -1.0),
     (1.0, -1.0, (1.0, 1.0, 0.0), 1.0),
 )
-_LIMITS = np.array(
-    [
-        limits
-        for *_, sign in _LEGS
-        for limits in ((-_HIP, _HIP), _ANKLE if sign > 0 else (-_ANKLE[1], -_ANKLE[0]))
-    ]
+# Middle of each joint's range, and how far from it the original calls a joint at its limit.
+_RANGES = tuple(
+    (sign * 0.5 * (low + high), 0.99 * 0.5 * (high - low))
+    for *_, sign in _LEGS
+    for low, high in ((-_HIP, _HIP), _ANKLE)
 )
 # The original measures progress at the mean of its 20 links, its torso and the floor.
 _PARTS = 22
@@ -68,6 +68,14 @@ def _segment(x: float, y: float, length: float) -> tuple[Capsule, float, tuple]:
     thickness = 2.0 * (_RADIUS + FROM_TO_MARGIN)
     width = length + thickness
     return capsule, capsule.mass, box_inertia(capsule.mass, (width, width, thickness))
+
+
+def _joints_at_limit(angles: list[float]) -> int:
+    """How many of the 8 joints are at a limit, or beyond it."""
+    return sum(
+        [abs(angle - middle) > tolerance
+         for angle, (middle, tolerance) in zip(angles, _RANGES, strict=True)]
+    )
 
 
 def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
@@ -170,17 +178,15 @@ class Ant(gymnasium.Env):
         size = 27 + len(self._zeros) + 2 * self.goal.observed
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (8,), np.float32)
-        self._middle = _LIMITS.mean(axis=1).astype(np.float32)
-        self._tolerance = (0.99 * 0.5 * (_LIMITS[:, 1] - _LIMITS[:, 0])).astype(np.float32)
-        # What each leg adds to the sum of the links' positions, hips aside: 2.5 upper
-        # segments (its middle once, its end twice) and half a lower one. A leg's direction in
-        # the torso's plane is a complex number.
-        directions = np.array([complex(x, y) for x, y, *_ in _LEGS])
-        scales = np.array([self.leg_length if y < 0 else 1.0 for _, y, *_ in _LEGS])
-        signs = np.array([sign for *_, sign in _LEGS])
-        self._upper = 2.5 * _UPPER * scales * directions
-        self._lower = 0.5 * _LOWER * scales * directions
-        self._drop = -0.5 * math.sqrt(2.0) * _LOWER * scales * signs
+        # What each leg adds to the sum of the links' positions, hips aside: 2.5 upper segments
+        # (its middle once, its end twice) and half a lower one. A leg's direction in the
+        # torso's plane is a complex number.
+        self._legs = []
+        for x, y, _, sign in _LEGS:
+            scale = self.leg_length if y < 0 else 1.0
+            direction = scale * complex(x, y)
+            drop = -0.5 * math.sqrt(2.0) * _LOWER * scale * sign
+            self._legs.append((2.5 * _UPPER * direction, 0.5 * _LOWER * direction, drop))
         self._world = World(render_mode)
 
     def reset(
@@ -208,7 +214,7 @@ class Ant(gymnasium.Env):
         if self.render_mode is not None:
             self._robot.paint((0.8, 0.5, 0.3, 1.0))
         self._robot.place(positions)
-        self._observation, self._potential = self._observe()
+        self._observation, _, self._potential = self._observe()
         return self._observation, {}
 
     def step(
@@ -221,11 +227,10 @@ class Ant(gymnasium.Env):
         """
         self._robot.drive(_TORQUE * clipped(action, 8))
         self._world.step()
-        observation, potential = self._observe()
+        observation, angles, potential = self._observe()
         if not is_finite(observation):
             return self._observation, 0.0, False, True, {"error": NOT_FINITE}
-        bent = np.abs(observation[5:13] - self._middle)
-        at_limit = -0.1 * int(np.count_nonzero(bent > self._tolerance))
+        at_limit = -0.1 * _joints_at_limit(angles)
         progress = potential - self._potential
         self._observation = observation
         self._potential = potential
@@ -255,8 +260,8 @@ class Ant(gymnasium.Env):
             joints = list(range(8))
         return Robot(client, body, joints, joints)
 
-    def _observe(self) -> tuple[np.ndarray, float]:
-        """The observation, and minus the distance to the goal over the time step."""
+    def _observe(self) -> tuple[np.ndarray, list[float], float]:
+        """The observation, the joint angles, and minus the distance to go over the time step."""
         client, body = self._robot.client, self._robot.body
         self._position, orientation = pybullet.getBasePositionAndOrientation(
             body, physicsClientId=client
@@ -273,22 +278,17 @@ class Ant(gymnasium.Env):
             *self._tail,
         ]
         observation = np.fromiter(values, np.float32, len(values))
-        x, y = self._mean_position(
-            orientation,
-            linear,
-            angular,
-            np.fromiter(angles, np.float64, 8),
-            np.fromiter(speeds, np.float64, 8),
-        )
-        return observation, -math.hypot(self._goal[0] - x, self._goal[1] - y) / TIME_STEP
+        x, y = self._mean_position(orientation, linear, angular, angles, speeds)
+        distance = math.hypot(self._goal[0] - x, self._goal[1] - y)
+        return observation, angles, -distance / TIME_STEP
 
     def _mean_position(
         self,
         orientation: Sequence[float],
         linear: Sequence[float],
         angular: Sequence[float],
-        angles: np.ndarray,
-        speeds: np.ndarray,
+        angles: list[float],
+        speeds: list[float],
     ) -> tuple[float, float]:
         """x and y of the mean over the original's 20 links, its torso and the floor.
 
@@ -297,10 +297,12 @@ class Ant(gymnasium.Env):
         is the legs', in closed form: cheaper than asking Bullet.
         """
         lag = TIME_STEP / SUBSTEPS
-        old = angles - lag * speeds
-        hips, ankles = old[0::2], old[1::2]
-        plane = complex((self._upper + self._lower * np.cos(ankles)) @ np.exp(1j * hips))
-        height = float(self._drop @ np.sin(ankles))
+        plane, height = 0j, 0.0
+        for leg, (upper, lower, drop) in enumerate(self._legs):
+            hip = angles[2 * leg] - lag * speeds[2 * leg]
+            ankle = angles[2 * leg + 1] - lag * speeds[2 * leg + 1]
+            plane += (upper + lower * math.cos(ankle)) * cmath.rect(1.0, hip)
+            height += drop * math.sin(ankle)
         rate = math.hypot(*angular)
         half = 0.5 * lag * rate
         scale = -math.sin(half) / rate if rate > 0.0 else 0.0
