@@ -140,17 +140,10 @@ def test_gravity_sets_the_static_torque_on_the_shoulder(model):
         wrench = pybullet.getJointState(arm, 0, physicsClientId=client)[2]
         moments.append(math.hypot(wrench[3], wrench[4]))
         if model == "merged":
-            center = pybullet.getDynamicsInfo(arm, 0, physicsClientId=client)[3][0]
-            # Bullet reports the wrench about the link's centre of mass.
-            weights = [
-                (pybullet.getDynamicsInfo(arm, link, physicsClientId=client)[0], x)
-                for link, x in ((0, 0.05), (1, 0.1 + 0.0563158))
-            ]
-            about_center = sum(m * GRAVITY * gravity * (x - center) for m, x in weights)
-            about_joint = sum(m * GRAVITY * gravity * x for m, x in weights)
-            assert moments[-1] == pytest.approx(about_center, rel=0.02) or moments[
-                -1
-            ] == pytest.approx(about_joint, rel=0.02)
+            # Bullet reports the moment about the upper arm's centre of mass.
+            mass, *_ = pybullet.getDynamicsInfo(arm, 1, physicsClientId=client)
+            lever = 0.05 + pybullet.getDynamicsInfo(arm, 1, physicsClientId=client)[3][0]
+            assert moments[-1] == pytest.approx(mass * gravity * GRAVITY * lever, rel=1e-5)
         env.close()
     assert moments[1] == pytest.approx(2.0 * moments[0], rel=1e-3)
     assert moments[2] == pytest.approx(4.0 * moments[0], rel=1e-3)
@@ -180,7 +173,12 @@ def glide(env, heading: float) -> float:
 
 @pytest.mark.parametrize(
     ("arguments", "heading"),
-    [({}, 0.0), ({"goal_y": 900.0}, 41.987), ({"goal_y": -900.0}, -41.987), ({"direction": 10.0}, 10)],
+    [
+        ({}, 0.0),
+        ({"goal_y": 900.0}, 41.987),
+        ({"goal_y": -900.0}, -41.987),
+        ({"direction": 10.0}, 10.0),
+    ],
 )
 def test_progress_rewards_a_straight_walk_to_the_goal(arguments, heading):
     progress = {}

@@ -36,7 +36,6 @@ from irlcli.envs.bullet.world import (
     start_positions,
 )
 
-
 _RADIUS = single(0.08)
 _FIXED = _UPPER = single(0.2)
 _LOWER = single(0.4)
@@ -73,8 +72,10 @@ def _segment(x: float, y: float, length: float) -> tuple[Capsule, float, tuple]:
 def _joints_at_limit(angles: list[float]) -> int:
     """How many of the 8 joints are at a limit, or beyond it."""
     return sum(
-        [abs(angle - middle) > tolerance
-         for angle, (middle, tolerance) in zip(angles, _RANGES, strict=True)]
+        [
+            abs(angle - middle) > tolerance
+            for angle, (middle, tolerance) in zip(angles, _RANGES, strict=True)
+        ]
     )
 
 
