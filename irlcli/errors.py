@@ -6,7 +6,6 @@ text and an exit status. Anything else that escapes is a defect of the program.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 
@@ -59,6 +58,9 @@ class Interrupted(IrlError):
 
 def suggest(name: str, known: Iterable[str]) -> str:
     """A hint for a mistyped ``name``: the closest known one, or the list of all of them."""
+    # Imported here: only mistakes need it, and every command imports this module.
+    import difflib
+
     known = sorted(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if close:

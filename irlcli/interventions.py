@@ -8,23 +8,21 @@ Grammar, per comma-separated value: ``2x`` multiplies the default, ``0.5`` is ab
 ``1.5:0.1:0.1`` is a triple, ``-10..0`` is drawn uniformly per episode.
 """
 
-from __future__ import annotations
-
 import math
 import re
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from irlcli.errors import UsageError, suggest
 
 Kind = Literal["multiplier", "absolute", "triple", "range"]
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_FORMS: dict[Kind, re.Pattern[str]] = {
-    "multiplier": re.compile(rf"({_NUMBER})x"),
-    "absolute": re.compile(rf"({_NUMBER})"),
-    "triple": re.compile(rf"({_NUMBER}):({_NUMBER}):({_NUMBER})"),
-    "range": re.compile(rf"({_NUMBER})\.\.({_NUMBER})"),
+# Compiled when used: every command imports this module.
+_FORMS: dict[Kind, str] = {
+    "multiplier": rf"({_NUMBER})x",
+    "absolute": rf"({_NUMBER})",
+    "triple": rf"({_NUMBER}):({_NUMBER}):({_NUMBER})",
+    "range": rf"({_NUMBER})\.\.({_NUMBER})",
 }
 _EXAMPLES: dict[Kind, str] = {
     "multiplier": "2x",
@@ -34,8 +32,7 @@ _EXAMPLES: dict[Kind, str] = {
 }
 
 
-@dataclass(frozen=True)
-class Value:
+class Value(NamedTuple):
     """One intervention value: its form and its one, two or three numbers."""
 
     kind: Kind
@@ -59,8 +56,7 @@ class Value:
         return self.numbers[0] if len(self.numbers) == 1 else self.numbers
 
 
-@dataclass(frozen=True)
-class Knob:
+class Knob(NamedTuple):
     """One mechanism of an environment that can be intervened on.
 
     ``low`` and ``high`` bound every number of a value (inclusive); ``kinds`` are the forms
@@ -75,14 +71,13 @@ class Knob:
     what: str
 
 
-@dataclass(frozen=True)
-class Environment:
+class Environment(NamedTuple):
     """What the program knows of an environment without importing it."""
 
     name: str
     gym_id: str
     max_episode_steps: int
-    knobs: dict[str, Knob] = field(default_factory=dict)
+    knobs: dict[str, Knob]
 
 
 ENVIRONMENTS: dict[str, Environment] = {
@@ -101,8 +96,7 @@ ENVIRONMENTS: dict[str, Environment] = {
 }
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """One intervened environment instance, e.g. ``engine-power=1.25x``; no knob is the default."""
 
     knob: str | None = None
@@ -155,7 +149,7 @@ def parse_value(env: str, knob: str, text: str) -> Value:
     spec = knob_of(env, knob)
     examples = " or ".join(_EXAMPLES[kind] for kind in spec.kinds)
     for kind, form in _FORMS.items():
-        match = form.fullmatch(text.strip())
+        match = re.fullmatch(form, text.strip())
         if match is None:
             continue
         if kind not in spec.kinds:

@@ -199,13 +199,16 @@ class PPOTrainer:
                 self._replace_rewards(rollout, reward(rollout))
             remaining = max(0.0, 1.0 - self.model.num_timesteps / self.total_steps)
             self.model._current_progress_remaining = remaining
+            if self.ppo.ent_coef_schedule == "linear":
+                # SB3 schedules the learning rate and the clip range only.
+                self.model.ent_coef = self.ppo.ent_coef * remaining
             self.model.train()
+            if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
+                raise StageFailed(
+                    f"the policy's parameters are not finite after an update in round {index}",
+                    "a smaller learning rate or gradient norm usually helps",
+                )
             rollouts.append(rollout)
-        if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
-            raise StageFailed(
-                f"the policy's parameters are not finite after round {index}",
-                "a smaller learning rate or gradient norm usually helps",
-            )
         return rollouts
 
     def _collect(self) -> Rollout:
@@ -322,11 +325,16 @@ def load_policy(description: dict[str, Any], state: dict[str, torch.Tensor]) -> 
 
 
 def make_worlds(env: str, settings: Sequence[Setting], count: int) -> VectorWorlds:
-    """``count`` worlds in equal shares of each setting, setting-major (world i: i*S//count)."""
+    """``count`` worlds in equal shares of each setting, as :func:`world_groups` says."""
     return VectorWorlds(
-        [envs.make(env, settings[i * len(settings) // count]) for i in range(count)],
+        [envs.make(env, settings[group]) for group in world_groups(count, len(settings))],
         environment(env).max_episode_steps,
     )
+
+
+def world_groups(count: int, settings: int) -> np.ndarray:
+    """Index [count] of the setting of each world: equal shares, setting-major."""
+    return np.arange(count) * settings // count
 
 
 def roll_out(

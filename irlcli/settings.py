@@ -1,20 +1,290 @@
-from __future__ import annotations
+"""Validated settings: TOML files, profiles, ``--set``.
+
+One file per environment in ``settings/``. Precedence, weakest first: the defaults below, the
+environment's file, its profile, ``--settings FILE``, then flags and ``--set``. Environment
+variables never enter: equal settings give equal artefacts wherever they run.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
 import msgspec
-class PPOSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    n_envs: int = 16
-    n_steps: int = 1024
-    batch_size: int = 512
-    n_epochs: int = 4
-    learning_rate: float = 1e-3
-    learning_rate_schedule: str = "constant"
-    clip_range: float = 0.2
-    clip_range_schedule: str = "constant"
-    gamma: float = 0.999
-    gae_lambda: float = 0.98
-    ent_coef: float = 0.01
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    net_arch: tuple[int, ...] = (64, 64)
-    activation: str = "tanh"
+from msgspec import Meta, Struct
+
+from irlcli.errors import UsageError, suggest
+from irlcli.interventions import environment, parse_settings
+
+PROFILES = ("smoke", "standard", "paper")
+
+Count = Annotated[int, Meta(ge=1)]
+NonNegativeCount = Annotated[int, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+# gamma = 1 would make the value of an absorbing state infinite.
+Discount = Annotated[float, Meta(ge=0, lt=1)]
+Widths = tuple[Count, ...]
+Schedule = Literal["constant", "linear"]
+Activation = Literal["tanh", "relu"]
+Method = Literal["erm", "erm-balanced", "irm"]
+
+
+class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """PPO (paper App. C names the values of rl-baselines3-zoo). ``linear`` falls to zero."""
+
+    n_envs: Count = 16
+    n_steps: Count = 1024
+    rollouts_per_round: Count = 1
+    batch_size: Annotated[int, Meta(ge=2)] = 512
+    n_epochs: Count = 4
+    learning_rate: Positive = 1e-3
+    learning_rate_schedule: Schedule = "constant"
+    clip_range: Positive = 0.2
+    clip_range_schedule: Schedule = "constant"
+    gamma: Discount = 0.999
+    gae_lambda: Fraction = 0.98
+    ent_coef: NonNegative = 0.01
+    ent_coef_schedule: Schedule = "constant"
+    vf_coef: NonNegative = 0.5
+    max_grad_norm: Positive = 0.5
+    net_arch: Widths = (64, 64)
+    activation: Activation = "tanh"
     ortho_init: bool = True
-    rollouts_per_round: int = 1
+
+
+class InterventionSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Paper Table 2: the values trained on and the held-out ones."""
+
+    id: tuple[str, ...]
+    ood: tuple[str, ...]
+
+
+class ExpertSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A policy trained on the true reward. ``bar`` is the mean true return that it must reach."""
+
+    total_steps: Count = 1_000_000
+    bar: float | None = None
+    ppo: PPOSettings = PPOSettings()
+
+
+class DemonstrationSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Episodes per setting, sampled from the stochastic expert unless ``deterministic``."""
+
+    episodes: Count = 10
+    deterministic: bool = False
+
+
+class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Adversarial IRL (paper Sec. 4.3, Algorithm 1, App. C)."""
+
+    method: Method = "erm"
+    total_steps: Count = 1_000_000
+    state_only: bool = False
+    hidden: Widths = (32, 32)
+    activation: Activation = "tanh"
+    learning_rate: Positive = 3e-4
+    weight_decay: NonNegative = 1e-4
+    max_grad_norm: Positive = 1.0
+    updates_per_round: Count = 10
+    batch_size: Annotated[int, Meta(ge=2, multiple_of=2)] = 256
+    replay_share: Fraction = 0.5
+    replay_per_round: Count = 1000
+    replay_capacity: Count = 50_000
+    penalty_weight: NonNegative = 10.0
+    penalty_warmup_rounds: NonNegativeCount = 10
+    penalty_ramp_rounds: NonNegativeCount = 10
+    penalty_scaling: Literal["logit", "reward"] = "logit"
+    penalty_estimate: Literal["unbiased", "square"] = "unbiased"
+    pairing: Literal["matched", "pooled"] = "matched"
+    policy_reward: Literal["f-log-pi", "f", "g"] = "f-log-pi"
+    fixed_horizon: bool = True
+    ppo: PPOSettings = PPOSettings()
+
+
+class TransferSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A new policy on a frozen reward (paper Sec. 5.3)."""
+
+    total_steps: Count = 1_000_000
+    ppo: PPOSettings = PPOSettings()
+
+
+class EvaluationSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """True return of a policy over whole episodes."""
+
+    episodes: Count = 20
+    deterministic: bool = False
+
+
+class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything that can be set for one environment."""
+
+    interventions: dict[str, InterventionSettings] = {}
+    expert: ExpertSettings = ExpertSettings()
+    demonstrations: DemonstrationSettings = DemonstrationSettings()
+    airl: AIRLSettings = AIRLSettings()
+    transfer: TransferSettings = TransferSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+
+
+def load_settings(
+    env: str,
+    profile: str = "standard",
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+) -> Settings:
+    """The settings of ``env``.
+
+    Args:
+        env: environment whose file in ``settings/`` is read.
+        profile: ``smoke``, ``standard`` or ``paper``.
+        file: a TOML file of the same form (without profiles) laid over it.
+        overrides: ``airl.penalty_weight=30``, each typed by its field.
+        flags: dotted field to value; those that are None are left out.
+
+    Raises:
+        UsageError: unknown environment, profile, field or value; malformed TOML.
+        OSError: ``file`` cannot be read.
+    """
+    environment(env)
+    if profile not in PROFILES:
+        raise UsageError(f"unknown profile {profile!r}", suggest(profile, PROFILES))
+    own = _settings_directory() / f"{env}.toml"
+    tree = _read_toml(own)
+    profiles = tree.pop("profiles", {})
+    layers = [(str(own), tree), (f"{own}, profile {profile}", profiles.get(profile, {}))]
+    if file is not None:
+        layers.append((str(file), _read_toml(file)))
+    layers += [(f"--set {item!r}", _override(item)) for item in overrides]
+    layers += [
+        (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted.split("."), value))
+        for dotted, value in (flags or {}).items()
+        if value is not None
+    ]
+    settings = _stack(layers)
+    for knob, values in settings.interventions.items():
+        for value in (*values.id, *values.ood):
+            parse_settings(env, f"{knob}={value}")
+    return settings
+
+
+def _stack(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Settings:
+    """The settings that ``layers`` of (source, values) lead to, later ones winning."""
+    tree: dict[str, Any] = {}
+    for _, values in layers:
+        tree = _merge(tree, values)
+    try:
+        return _convert(tree, "settings")
+    except UsageError:
+        # Alone, the layer at fault fails too, and the error names it.
+        for source, values in layers:
+            _convert(values, source)
+        raise
+
+
+def _settings_directory() -> Path:
+    """``settings/`` of the checkout, or its copy inside an installed package."""
+    packaged = Path(__file__).parent / "settings_files"
+    return packaged if packaged.is_dir() else Path(__file__).parent.parent / "settings"
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(
+            f"{path} is not valid TOML: {error}", "see settings/ for examples"
+        ) from None
+    except OSError as error:
+        raise UsageError(
+            f"{path} cannot be read: {error.strerror}", "name a TOML file with --settings"
+        ) from None
+
+
+def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for name, value in over.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+        merged[name] = _merge(merged[name], value) if both else value
+    return merged
+
+
+def _nest(path: Sequence[str], value: Any) -> dict[str, Any]:
+    for name in reversed(path):
+        value = {name: value}
+    return value
+
+
+def _convert(tree: Mapping[str, Any], source: str) -> Settings:
+    _check_names(tree, Settings, (), source)
+    try:
+        return msgspec.convert(tree, Settings)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at ")
+        field = where.strip("`").removeprefix("$.")
+        raise UsageError(f"{source}: {field}: {message}", _field_hint(field)) from None
+
+
+def _check_names(tree: Any, kind: type, path: tuple[str, ...], source: str) -> None:
+    """Refuse unknown names here: msgspec names them without a suggestion."""
+    if not isinstance(tree, Mapping):
+        return
+    fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+    for name, value in tree.items():
+        if name not in fields:
+            where = ".".join((*path, str(name)))
+            raise UsageError(f"{source}: no setting {where!r}", suggest(str(name), fields))
+        inner = fields[name]
+        if isinstance(inner, type) and issubclass(inner, Struct):
+            _check_names(value, inner, (*path, name), source)
+
+
+def _override(item: str) -> dict[str, Any]:
+    dotted, equals, text = item.partition("=")
+    path = dotted.strip().split(".")
+    if not equals:
+        raise UsageError(f"--set {item!r} has no '='", "write --set airl.penalty_weight=30")
+    kind: Any = Settings
+    for i, name in enumerate(path):
+        if not (isinstance(kind, type) and issubclass(kind, Struct)):
+            raise UsageError(f"--set {item!r}: {'.'.join(path[:i])} has no fields")
+        fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+        if name not in fields:
+            raise UsageError(
+                f"--set {item!r}: no setting {dotted.strip()!r}", suggest(name, fields)
+            )
+        kind = fields[name]
+        if kind == dict[str, InterventionSettings]:
+            raise UsageError(
+                f"--set {item!r}: interventions are not set this way", "use --intervention or --ood"
+            )
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        names = ", ".join(f"{dotted.strip()}.{f.name}" for f in msgspec.structs.fields(kind))
+        raise UsageError(f"--set {item!r} names a group of settings", f"one of: {names}")
+    return _nest(path, _typed(text.strip(), kind, dotted.strip()))
+
+
+def _typed(text: str, kind: Any, field: str) -> Any:
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, RecursionError):
+        value = text
+    try:
+        return msgspec.to_builtins(msgspec.convert(value, kind))
+    except msgspec.ValidationError as error:
+        raise UsageError(
+            f"--set {field}={text}: {str(error).partition(' - at ')[0]}", _field_hint(field)
+        ) from None
+
+
+def _field_hint(field: str) -> str:
+    """The default of a field, as an example of what it takes."""
+    value: Any = Settings()
+    for name in field.split("."):
+        name = name.partition("[")[0]
+        if not isinstance(value, Struct) or not hasattr(value, name):
+            return "see settings/ for examples"
+        value = getattr(value, name)
+    return f"its default is {msgspec.json.encode(value).decode()}"

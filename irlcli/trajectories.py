@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -87,6 +87,10 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.actions)
 
+    def take(self, rows: np.ndarray) -> Transitions:
+        """The transitions at ``rows``."""
+        return Transitions(*(getattr(self, f.name)[rows] for f in fields(self)))
+
 
 def transitions(trajectories: Sequence[Trajectory], horizon: int) -> Transitions:
     """All transitions of ``trajectories``; ``horizon`` is the environment's time limit [steps].
@@ -111,5 +115,8 @@ def transitions(trajectories: Sequence[Trajectory], horizon: int) -> Transitions
     )
 
 
-Dataset = Mapping[str, tuple[Trajectory, ...]]
-"""Demonstrations by setting, in the order the settings were named."""
+def join(parts: Sequence[Transitions]) -> Transitions:
+    """The transitions of all ``parts``, one after the other."""
+    return Transitions(
+        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Transitions))
+    )

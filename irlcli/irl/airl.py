@@ -12,7 +12,8 @@ through, and the discriminator sees each absorbing state as often as stepping wo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -66,9 +67,26 @@ def make_pool(
         terminated = torch.zeros(len(observations))
         absorbed = len(data) + np.arange(len(ends))
         draw = np.concatenate([draw, np.repeat(absorbed, data.remaining[ends])])
-    return Pool(
-        observations, actions, successors, terminated, log_probs, torch.as_tensor(draw)
-    )
+    return Pool(observations, actions, successors, terminated, log_probs, torch.as_tensor(draw))
+
+
+def join_pools(pools: Sequence[Pool]) -> Pool:
+    """One pool of several, each row drawn as often as before."""
+    offsets = np.cumsum([0] + [len(pool.observations) for pool in pools[:-1]])
+    draw = torch.cat([pool.draw + int(o) for pool, o in zip(pools, offsets, strict=True)])
+    rows = (torch.cat([getattr(pool, f.name) for pool in pools]) for f in fields(Pool)[:-1])
+    return Pool(*rows, draw)
+
+
+def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
+    """Standard deviation of g over the samples of ``pools``, each row as often as drawn.
+
+    Fixed on training data, it makes frozen rewards of different runs comparable to a policy
+    trained on them; nothing is centred, as that would change what the reward asks for.
+    """
+    with torch.no_grad():
+        g = torch.cat([model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools])
+    return max(float(g.double().std()), 1e-6)
 
 
 @dataclass(frozen=True)
@@ -83,13 +101,21 @@ class Minibatch:
 
 
 def sample_minibatch(
-    policy: list[Pool], expert: list[Pool], size: int, generator: torch.Generator
+    policy: Sequence[Pool],
+    expert: Sequence[Pool],
+    size: int,
+    generator: torch.Generator,
+    past: Sequence[Pool] = (),
+    past_share: float = 0.0,
 ) -> Minibatch:
-    """``size`` samples of either label for each of the E groups, with replacement."""
+    """``size`` samples of either label for each of the E groups, with replacement.
 
-    def fields(pool: Pool) -> tuple[torch.Tensor, ...]:
-        picks = torch.randint(len(pool.draw), (size,), generator=generator)
-        rows = pool.draw[picks]
+    Of the policy's samples a share of ``past_share`` comes from ``past``, pools of earlier
+    rounds: without them the discriminator forgets what the policy no longer does.
+    """
+
+    def fields(pool: Pool, count: int) -> tuple[torch.Tensor, ...]:
+        rows = pool.draw[torch.randint(len(pool.draw), (count,), generator=generator)]
         return (
             pool.observations[rows],
             pool.actions[rows],
@@ -98,10 +124,15 @@ def sample_minibatch(
             pool.log_probs[rows],
         )
 
-    groups = [
-        [torch.stack(pair) for pair in zip(fields(p), fields(e), strict=True)]
-        for p, e in zip(policy, expert, strict=True)
-    ]
+    old = round(size * past_share) if past else 0
+    groups = []
+    for e in range(len(expert)):
+        generated = fields(policy[e], size - old)
+        if old:
+            both = zip(generated, fields(past[e], old), strict=True)
+            generated = tuple(torch.cat(pair) for pair in both)
+        pairs = zip(generated, fields(expert[e], size), strict=True)
+        groups.append([torch.stack(pair) for pair in pairs])
     return Minibatch(*(torch.stack(column) for column in zip(*groups, strict=True)))
 
 
@@ -171,12 +202,14 @@ def policy_reward(
     log_probs: torch.Tensor,
     form: str,
     absorbing: bool,
+    gamma: float,
 ) -> torch.Tensor:
     """What the policy is paid for each transition, [B] float32, without gradient.
 
     ``form`` is ``f-log-pi`` (log D - log(1 - D), Algorithm 1), ``f`` or ``g``. With
     ``absorbing``, a terminated transition also earns the discounted sum of everything its
-    absorbing state pays: gamma / (1 - gamma) times the reward there, where log pi is zero.
+    absorbing state pays to a policy that discounts by ``gamma``: gamma / (1 - gamma) times the
+    reward there, where log pi is zero.
     """
     with torch.no_grad():
         observations = torch.as_tensor(data.observations)
@@ -192,6 +225,6 @@ def policy_reward(
             reward = reward - log_probs
         if absorbing and bool(terminated.any()):
             g, f = model.absorbing_reward(successors)
-            series = model.gamma / (1.0 - model.gamma)
+            series = gamma / (1.0 - gamma)
             reward = reward + terminated * series * (g if form == "g" else f)
         return reward

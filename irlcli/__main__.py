@@ -1,0 +1,5 @@
+"""``python -m irlcli`` is ``irl``."""
+
+from irlcli.cli import main
+
+main()

@@ -1,0 +1,650 @@
+"""The command line: parse, call the runner, print. Heavy libraries load only where work is done."""
+
+import inspect
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from irlcli import console as out
+from irlcli.errors import IntegrityError, Interrupted, IrlError, NotFound, StageFailed, UsageError
+
+_COMMANDS: dict[str, tuple[Callable, bool]] = {}
+
+Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
+Seed = Annotated[int, typer.Option(min=0, help="Everything random derives from it.")]
+Name = Annotated[str | None, typer.Option(help="Name to give the artefact.")]
+Env = Annotated[str | None, typer.Option(help="Environment, e.g. lunar-lander.")]
+
+
+class Session:
+    """The options every command has, and what they lead to."""
+
+    def __init__(
+        self,
+        store: Path,
+        as_json: bool,
+        profile: str = "standard",
+        settings: Path | None = None,
+        overrides: Sequence[str] = (),
+        dry_run: bool = False,
+        wait: bool = True,
+        quiet: bool = False,
+        tensorboard: Path | None = None,
+    ):
+        from irlcli.store import Store
+
+        self.store = Store(store)
+        self.as_json = as_json
+        self._profile = profile
+        self._settings = settings
+        self._overrides = list(overrides)
+        self._dry_run = dry_run
+        self._wait = wait
+        self._console = out.TerminalConsole(quiet, tensorboard)
+
+    def settings(self, env: str, flags: dict[str, Any] | None = None):
+        """Settings of ``env`` under this session's options."""
+        from irlcli.settings import load_settings
+
+        return load_settings(env, self._profile, self._settings, self._overrides, flags)
+
+    def deliver(self, requests: Sequence[Any], name: str | None = None) -> list[Any]:
+        """Run requests (or plan them, with --dry-run) and print one line for each."""
+        from irlcli.runner import Runner
+
+        runner = Runner(self.store, self._console, self._wait)
+        if self._dry_run:
+            self._print_plan([step for request in requests for step in runner.plan(request)])
+            return []
+        artefacts = []
+        try:
+            for request in requests:
+                artefacts.append(runner.run(request))
+        finally:
+            self._console.close()
+        if name is not None:
+            self.store.set_name(name, artefacts[0])
+        for artefact in artefacts:
+            record = artefact.manifest.record
+            if self.as_json:
+                out.print_json(
+                    "artefact",
+                    {
+                        "id": artefact.id,
+                        "path": str(artefact.directory),
+                        "stage": record.stage,
+                        "name": name,
+                        "outputs": [o.path for o in artefact.manifest.outputs],
+                    },
+                )
+            else:
+                out.print_data(str(artefact.directory))
+        return artefacts
+
+    def _print_plan(self, steps: Sequence[Any]) -> None:
+        if self.as_json:
+            plan = [{"status": s.status, "request": s.label, "why": s.why} for s in steps]
+            out.print_json("plan", {"steps": plan})
+            return
+        for step in steps:
+            out.print_data(f"{step.status:8}{step.label}: {step.why}")
+
+
+def command(name: str, runs: bool = True) -> Callable:
+    """Register a command whose first argument is the :class:`Session` of the common options.
+
+    Commands that run stages (``runs``) also take the options that only concern these.
+    """
+
+    def register(function: Callable) -> Callable:
+        _COMMANDS[name] = (function, runs)
+        return function
+
+    return register
+
+
+def _common_options(runs: bool) -> list[inspect.Parameter]:
+    def option(name: str, default: Any, type_: Any, help_: str, *flags: str, **more: Any):
+        annotation = Annotated[type_, typer.Option(*flags, help=help_, **more)]
+        return inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+        )
+
+    common = [
+        option("store", Path("runs"), Path, "Artefact store.", "--store", envvar="IRL_STORE"),
+        option("as_json", False, bool, "Versioned JSON on stdout.", "--json"),
+        option("debug", False, bool, "Show tracebacks.", "--debug"),
+    ]
+    if runs:
+        common += [
+            option("profile", "standard", str, "smoke, standard or paper.", "--profile"),
+            option("settings", None, Path | None, "TOML file over the profile.", "--settings"),
+            option("overrides", [], list[str], "FIELD=VALUE, repeatable.", "--set"),
+            option("dry_run", False, bool, "Say what would be done.", "--dry-run"),
+            option("wait", True, bool, "Wait for a process making the same.", "--wait/--no-wait"),
+            option("quiet", False, bool, "No progress on stderr.", "--quiet"),
+            option("tensorboard", None, Path | None, "Mirror metrics here.", "--tensorboard"),
+        ]
+    return common
+
+
+def _with_common_options(function: Callable, runs: bool) -> Callable:
+    """``function`` as typer should see it: the session's options in place of the session."""
+    common = _common_options(runs)
+    own = [
+        p.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for p in list(inspect.signature(function).parameters.values())[1:]
+    ]
+
+    def run(**values: Any) -> None:
+        # Read by main() from the arguments: an error may come before they are parsed.
+        del values["debug"]
+        session = Session(**{p.name: values.pop(p.name) for p in common if p.name in values})
+        function(session, **values)
+
+    run.__signature__ = inspect.Signature([*own, *common])
+    run.__annotations__ = {p.name: p.annotation for p in [*own, *common]}
+    run.__doc__ = function.__doc__
+    return run
+
+
+@command("collect-experts")
+def collect_experts(
+    session: Session,
+    env: Annotated[str, typer.Option(help="Environment, e.g. lunar-lander.")],
+    intervention: Annotated[
+        str, typer.Option(help="KNOB=VALUE,VALUE; KNOB alone takes its ID values from settings/.")
+    ],
+    episodes: Annotated[
+        str | None, typer.Option(help="Per setting: 10, or 1,3,10 for three settings.")
+    ] = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Train an expert in each setting and record its demonstrations."""
+    from irlcli.stages import collect_experts
+
+    config = session.settings(env)
+    settings = _settings(env, config, intervention, "id")
+    counts = None if episodes is None else _counts(episodes)
+    session.deliver([collect_experts.request(env, settings, config, seed, counts)], name)
+
+
+@command("train-airl")
+def train_airl(
+    session: Session,
+    demos: Annotated[str, typer.Option(help="Demonstrations: an artefact.")],
+    method: Annotated[str | None, typer.Option(help="erm, erm-balanced or irm.")] = None,
+    penalty_weight: Annotated[float | None, typer.Option(help="lambda of IRM.")] = None,
+    state_only: Annotated[bool, typer.Option("--state-only", help="g(s), not g(s, a).")] = False,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Learn a reward and a student policy from demonstrations."""
+    from irlcli.interventions import parse_setting
+    from irlcli.references import demonstrations
+    from irlcli.stages import train_airl
+
+    source, env, settings = demonstrations(session.store, demos)
+    flags = {
+        "airl.method": method,
+        "airl.penalty_weight": penalty_weight,
+        "airl.state_only": state_only or None,
+    }
+    config = session.settings(env, flags)
+    parsed = [parse_setting(env, text) for text in settings]
+    session.deliver([train_airl.request(source, env, parsed, config.airl, seed)], name)
+
+
+@command("transfer")
+def transfer(
+    session: Session,
+    reward: Annotated[str, typer.Option(help="A learned reward: reward.pt or its artefact.")],
+    ood: Annotated[
+        str, typer.Option(help="Setting: VALUE, KNOB=VALUE, or KNOB for its OOD value.")
+    ],
+    env: Env = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Train a new policy on a frozen reward in an unseen setting."""
+    from irlcli.references import tensor_file
+    from irlcli.stages import transfer
+
+    source, origin = tensor_file(session.store, reward, "reward")
+    _same_env(reward, origin["env"], env)
+    config = session.settings(origin["env"])
+    settings = _settings(origin["env"], config, ood, "ood", origin)
+    if len(settings) != 1:
+        names = ", ".join(str(s) for s in settings)
+        raise UsageError(
+            f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one"
+        )
+    request = transfer.request(source, origin["env"], settings[0], config.transfer, seed)
+    session.deliver([request], name)
+
+
+@command("evaluate")
+def evaluate(
+    session: Session,
+    policy: Annotated[str | None, typer.Option(help="policy.pt or its artefact.")] = None,
+    expert: Annotated[bool, typer.Option("--expert", help="The expert of each setting.")] = False,
+    random: Annotated[bool, typer.Option("--random", help="Uniformly random actions.")] = False,
+    idle: Annotated[bool, typer.Option("--idle", help="Does nothing.")] = False,
+    ood: Annotated[
+        str | None,
+        typer.Option(help="VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB (OOD values)."),
+    ] = None,
+    intervention: Annotated[
+        str | None, typer.Option(help="KNOB=VALUE,..., or KNOB (ID values).")
+    ] = None,
+    env: Env = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Per setting.")] = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Measure the true return of a policy, an expert, or the random or idle agent."""
+    agents = [policy is not None, expert, random, idle]
+    if sum(agents) != 1:
+        raise UsageError(
+            f"{sum(agents) or 'no'} agents are named where one is needed",
+            "give one of --policy REF, --expert, --random, --idle",
+        )
+    if ood is not None and intervention is not None:
+        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    if policy is not None:
+        artefacts = _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name)
+    else:
+        agent = "expert" if expert else "random" if random else "idle"
+        artefacts = _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name)
+    if artefacts and not session.as_json:
+        _print_returns(session, [a.id for a in artefacts], stderr=True)
+
+
+def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name):
+    from irlcli.interventions import parse_setting
+    from irlcli.references import tensor_file
+    from irlcli.stages import evaluate
+
+    source, origin = tensor_file(session.store, policy, "policy")
+    _same_env(policy, origin["env"], env)
+    config = session.settings(origin["env"], {"evaluation.episodes": episodes})
+    if ood is not None or intervention is not None:
+        kind = "id" if ood is None else "ood"
+        settings = _settings(origin["env"], config, ood or intervention, kind, origin)
+    else:
+        settings = [parse_setting(origin["env"], s) for s in origin["settings"]]
+    request = evaluate.request(origin["env"], settings, config.evaluation, source, seed=seed)
+    return session.deliver([request], name)
+
+
+def _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name):
+    from irlcli.stages import From, evaluate, train_expert
+
+    if env is None or (ood is None and intervention is None):
+        raise UsageError(
+            f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"
+        )
+    config = session.settings(env, {"evaluation.episodes": episodes})
+    settings = _settings(env, config, ood or intervention, "id" if ood is None else "ood")
+    if agent != "expert":
+        request = evaluate.request(env, settings, config.evaluation, agent=agent, seed=seed)
+        return session.deliver([request], name)
+    if name is not None and len(settings) > 1:
+        raise UsageError(
+            f"--name {name!r} cannot stand for {len(settings)} evaluations",
+            "evaluate the expert of one setting at a time to name it",
+        )
+    requests = [
+        evaluate.request(
+            env,
+            [setting],
+            config.evaluation,
+            From(train_expert.request(env, setting, 0, config.expert), "policy.pt"),
+            seed=seed,
+        )
+        for setting in settings
+    ]
+    return session.deliver(requests, name)
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"--episodes {text!r} is no list of counts", "write 10, or 1,3,10 for three settings"
+        ) from None
+
+
+def _same_env(ref: str, learned: str, wanted: str | None) -> None:
+    if wanted is not None and wanted != learned:
+        from irlcli.interventions import environment
+
+        environment(wanted)
+        raise UsageError(
+            f"{ref!r} was learned in {learned}, not in {wanted}",
+            "rewards and policies do not fit another environment's observations",
+        )
+
+
+def _settings(
+    env: str, config: Any, text: str, kind: str, origin: dict[str, Any] | None = None
+) -> Sequence[Any]:
+    """The settings that ``text`` names.
+
+    ``knob=3x,4x``; a knob alone stands for the values listed for it (``kind`` id or ood) in the
+    settings file; ``3x,4x`` alone belongs to the knob that ``origin`` was trained with.
+    """
+    from irlcli.interventions import environment, knob_of, parse_settings
+
+    if "=" in text:
+        return parse_settings(env, text)
+    if text in config.interventions:
+        values = getattr(config.interventions[text], kind)
+        return parse_settings(env, f"{text}={','.join(values)}")
+    if origin is None or text in environment(env).knobs or text[:1].isalpha():
+        knob_of(env, text)
+        raise UsageError(f"{text!r} names no value", f"write {text}=VALUE,VALUE")
+    knob, equals, _ = origin["settings"][0].partition("=")
+    if not equals:
+        raise UsageError(f"{text!r} names no knob", "write KNOB=VALUE")
+    return parse_settings(env, f"{knob}={text}")
+
+
+@command("ls", runs=False)
+def ls(
+    session: Session,
+    stage: Annotated[str | None, typer.Option(help="Only this stage.")] = None,
+) -> None:
+    """List the artefacts."""
+    names: dict[str, list[str]] = {}
+    for name, id16 in session.store.names().items():
+        names.setdefault(id16, []).append(name)
+    found = [
+        {
+            "id": a.id,
+            "stage": a.manifest.record.stage,
+            "names": names.get(a.id, []),
+            "about": _about(a.manifest.record.parameters),
+            "bytes": sum(o.size for o in a.manifest.outputs),
+        }
+        for a in session.store.artefacts()
+        if stage is None or a.manifest.record.stage == stage
+    ]
+    found.sort(key=lambda item: (item["stage"], item["about"], item["id"]))
+    if session.as_json:
+        out.print_json("artefacts", {"artefacts": found})
+        return
+    rows = [[f["id"], f["stage"], f["about"], ", ".join(f["names"])] for f in found]
+    if rows:
+        out.print_table(["id", "stage", "about", "names"], rows)
+
+
+def _about(parameters: dict[str, Any]) -> str:
+    """The parameters that tell one artefact of a stage from another."""
+    settings = parameters.get("settings") or [parameters.get("setting")]
+    parts = [parameters.get("env"), parameters.get("agent"), *settings]
+    parts.append(parameters.get("airl", {}).get("method"))
+    parts.append(f"seed {parameters['seed']}" if "seed" in parameters else None)
+    return " ".join(str(p) for p in parts if p and p != "policy")
+
+
+@command("show", runs=False)
+def show(session: Session, ref: Ref) -> None:
+    """Show an artefact: what made it, from what, and what it holds."""
+    import json
+
+    artefact = _artefact(session, ref)
+    record = artefact.manifest.record
+    value = {
+        "id": artefact.id,
+        "path": str(artefact.directory),
+        "key": record.key,
+        **record.as_json(),
+        "outputs": {
+            o.path: {"size": o.size, "sha256": o.sha256} for o in artefact.manifest.outputs
+        },
+        "provenance": artefact.provenance(),
+    }
+    if session.as_json:
+        out.print_json("artefact", value)
+    else:
+        out.print_data(json.dumps(value, indent=2))
+
+
+@command("lineage", runs=False)
+def lineage(session: Session, ref: Ref) -> None:
+    """Show everything an artefact was made from, down to the experts."""
+    artefact = _artefact(session, ref)
+    tree = _lineage(session, artefact)
+    if session.as_json:
+        out.print_json("lineage", tree)
+        return
+    for line in _lineage_lines(tree, ""):
+        out.print_data(line)
+
+
+def _lineage(session: Session, artefact: Any) -> dict[str, Any]:
+    record = artefact.manifest.record
+    inputs = [
+        {
+            "role": role,
+            "sha256": record.inputs[role],
+            "from": _lineage(session, sources[0]) if sources else None,
+        }
+        for role, sources in session.store.ancestors(artefact).items()
+    ]
+    about = _about(record.parameters)
+    return {"id": artefact.id, "stage": record.stage, "about": about, "inputs": inputs}
+
+
+def _lineage_lines(node: dict[str, Any], indent: str) -> list[str]:
+    lines = [f"{indent}{node['id']}  {node['stage']}  {node['about']}"]
+    for item in node["inputs"]:
+        if item["from"] is None:
+            lines.append(f"{indent}  {item['sha256'][:16]}  a file that is not in this store")
+        else:
+            lines += _lineage_lines(item["from"], indent + "  ")
+    return lines
+
+
+@command("verify", runs=False)
+def verify(
+    session: Session,
+    ref: Annotated[str | None, typer.Argument(help="One artefact; all by default.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Compare sizes, hash nothing.")] = False,
+) -> None:
+    """Check stored bytes against their digests; damaged artefacts go to quarantine."""
+    ids = [_artefact(session, ref).id] if ref else session.store.ids()
+    damaged = session.store.verify(ids, quick)
+    if session.as_json and not damaged:
+        out.print_json("verify", {"checked": len(ids), "damaged": {}})
+    elif not damaged:
+        out.print_data(f"{len(ids)} artefacts verified")
+    if damaged:
+        for id16, damage in damaged.items():
+            for problem in damage.problems:
+                print(f"{id16}: {problem}", file=sys.stderr)
+            if damage.command:
+                print(f"{id16}: was made by: {damage.command}", file=sys.stderr)
+        raise IntegrityError(
+            f"{len(damaged)} of {len(ids)} artefacts were damaged and are in quarantine: "
+            + ", ".join(damaged),
+            "run the commands above again: what is missing is recomputed",
+        )
+
+
+@command("gc", runs=False)
+def gc(
+    session: Session,
+    delete: Annotated[bool, typer.Option("--delete", help="Do it; only shown by default.")] = False,
+    grace_days: Annotated[float, typer.Option(min=0, help="Spare what is younger [days].")] = 7.0,
+) -> None:
+    """Find (and with --delete remove) artefacts that no name leads to."""
+    grace = grace_days * 86400
+    if delete:
+        artefacts, work = session.store.collect(grace)
+    else:
+        artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
+    size = sum(o.size for a in artefacts for o in a.manifest.outputs)
+    if session.as_json:
+        value = {"deleted": delete, "artefacts": [a.id for a in artefacts], "bytes": size}
+        out.print_json("gc", {**value, "work": [p.name for p in work]})
+        return
+    for artefact in artefacts:
+        record = artefact.manifest.record
+        out.print_data(f"{artefact.id}  {record.stage}  {_about(record.parameters)}")
+    for path in work:
+        out.print_data(f"{path.name[:16]}  scratch of an interrupted run")
+    verb = "removed" if delete else "would be removed (add --delete)"
+    print(f"{len(artefacts)} artefacts, {size:,} bytes {verb}", file=sys.stderr)
+
+
+@command("name", runs=False)
+def name(
+    session: Session,
+    ref: Ref,
+    name: Annotated[str, typer.Argument(help="The name; keeps the artefact from gc.")],
+) -> None:
+    """Name an artefact."""
+    artefact = _artefact(session, ref)
+    session.store.set_name(name, artefact)
+    if session.as_json:
+        out.print_json("name", {"name": name, "id": artefact.id})
+    else:
+        out.print_data(str(artefact.directory))
+
+
+@command("report", runs=False)
+def report(
+    session: Session,
+    kind: Annotated[str, typer.Argument(help="returns")],
+    refs: Annotated[list[str], typer.Argument(help="Evaluations.")],
+) -> None:
+    """Tabulate results: ``irl report returns REF...`` puts true returns side by side."""
+    if kind != "returns":
+        raise UsageError(f"unknown report {kind!r}", "known: returns")
+    _print_returns(session, refs)
+
+
+def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) -> None:
+    from irlcli.references import evaluation
+    from irlcli.report.returns import rows
+
+    found = rows(evaluation(session.store, ref)[1] for ref in refs)
+    if session.as_json:
+        items = [
+            {
+                "agent": row.agent,
+                "env": row.env,
+                "setting": row.setting,
+                "returns": list(row.returns),
+                "mean": row.mean,
+                "std_over_seeds": row.deviation,
+                "episodes_per_seed": row.episodes,
+            }
+            for row in found
+        ]
+        out.print_json("returns", {"rows": items})
+        return
+    table = [
+        [
+            row.agent,
+            f"{row.env} {row.setting}",
+            f"{row.mean:.1f}",
+            "-" if row.deviation is None else f"{row.deviation:.1f}",
+            str(len(row.returns)),
+            str(row.episodes),
+        ]
+        for row in found
+    ]
+    columns = ["agent", "setting", "true return", "sd over seeds", "seeds", "episodes each"]
+    out.print_table(columns, table, stderr=stderr)
+
+
+def _artefact(session: Session, ref: str) -> Any:
+    resolved = session.store.resolve(ref)
+    if resolved.artefact is None:
+        raise NotFound(f"{ref!r} is a file outside the store", "`irl ls` lists the artefacts")
+    return resolved.artefact
+
+
+def build_app(arguments: Sequence[str]) -> typer.Typer:
+    """The command line; only the command that ``arguments`` begin with, if they name one.
+
+    Typer inspects every option of every command it holds, which takes longer than a hit.
+    """
+    app = typer.Typer(
+        name="irl",
+        help="Invariant reward learning: experts, adversarial IRL, transfer, evaluation.",
+        no_args_is_help=True,
+        add_completion=False,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+    )
+    # A callback keeps it a group of commands when there is only one.
+    app.callback()(lambda: None)
+    first = arguments[0] if arguments else ""
+    for name, (function, runs) in _COMMANDS.items():
+        if first not in _COMMANDS or name == first:
+            app.command(name)(_with_common_options(function, runs))
+    return app
+
+
+def main() -> None:
+    """Entry point: exit codes and one-line errors (design: Command line)."""
+    as_json = "--json" in sys.argv
+    try:
+        build_app(sys.argv[1:])(standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read our output has enough; Python would complain again at shutdown.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except KeyboardInterrupt:
+        _fail(Interrupted("interrupted", "run the same command again to go on"), as_json)
+    except IrlError as error:
+        _fail(error, as_json)
+    except Exception as error:
+        if hasattr(error, "format_message"):
+            _fail(_usage(error), as_json)
+        if _debugging():
+            raise
+        text = (str(error) or "no message").splitlines()[0]
+        _fail(
+            StageFailed(
+                f"unexpected {type(error).__name__}: {text}",
+                "this is a defect: run again with --debug and report the traceback",
+            ),
+            as_json,
+        )
+
+
+def _usage(error: Any) -> UsageError:
+    """A mistake that the argument parser found, as one of ours."""
+    context = getattr(error, "ctx", None)
+    path = context.command_path if context is not None else "irl"
+    message = error.format_message().replace("\n", " ").rstrip(".")
+    return UsageError(message[0].lower() + message[1:], f"`{path} --help` shows what it takes")
+
+
+def _fail(error: IrlError, as_json: bool) -> None:
+    if _debugging():
+        import traceback
+
+        traceback.print_exc()
+    out.print_error(error, as_json)
+    sys.exit(error.exit_code)
+
+
+def _debugging() -> bool:
+    return "--debug" in sys.argv
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""What a person sees: progress and tables on stderr, data on stdout.
+
+Rich is loaded only where something is drawn: a hit prints one line without it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from irlcli.errors import IrlError, UsageError
+
+if TYPE_CHECKING:
+    from irlcli.store import Artefact
+
+JSON_VERSION = 1
+_PLAIN_SECONDS = 10.0
+
+
+class TerminalConsole:
+    """Progress of stages on stderr: a live bar on a terminal, plain lines elsewhere."""
+
+    def __init__(self, quiet: bool = False, tensorboard: Path | None = None):
+        self._quiet = quiet
+        self._live = None
+        self._task = None
+        self._label = ""
+        self._started = self._printed = 0.0
+        self._first_done: int | None = None
+        self._tensorboard = tensorboard
+        self._writer = None
+        self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
+
+    def start(self, label: str, resumed: bool) -> None:
+        """A stage begins; ``resumed`` if from a checkpoint."""
+        self._label = label
+        self._started, self._first_done = time.monotonic(), None
+        self._printed = self._started - _PLAIN_SECONDS
+        self._close_live()
+        self._say(f"{'RESUME' if resumed else 'RUN'} {label}")
+
+    def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
+        """How far the present stage is."""
+        now = time.monotonic()
+        if self._first_done is None:
+            # A resumed stage did not do its first steps in this process.
+            self._first_done, self._started = done, now
+        rate = (done - self._first_done) / (now - self._started) if now > self._started else 0.0
+        left = f"{_duration((total - done) / rate)} left" if rate > 0 else ""
+        speed = f"{rate:,.0f} {unit}/s" if rate >= 10 else ""
+        parts = [speed, left, *(f"{name} {fact}" for name, fact in facts.items())]
+        detail = "  ".join(p for p in parts if p)
+        if self._rich:
+            self._draw(done, total, detail)
+        elif now - self._printed >= _PLAIN_SECONDS or done >= total:
+            self._printed = now
+            self._say(f"  {self._label}: {done:,}/{total:,} {unit}  {detail}")
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Mirror metrics to TensorBoard, if asked."""
+        if self._tensorboard is None:
+            return
+        if self._writer is None:
+            directory = self._label.replace(" ", "_").replace(",", "")
+            self._writer = _summary_writer(self._tensorboard / directory)
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def warn(self, message: str) -> None:
+        """Say it whatever else is shown."""
+        self._print(f"warning: {message}", style="bold yellow")
+
+    def wait(self, label: str, holder: str) -> None:
+        """Another process makes the same artefact."""
+        self._say(f"WAIT {label}: {holder} is making it")
+
+    def finish(self, artefact: Artefact, hit: bool) -> None:
+        """A stage ended, or its artefact was there."""
+        self._close_live()
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+        record = artefact.manifest.record
+        if hit:
+            self._say(f"HIT {record.stage} {artefact.id}")
+        else:
+            self._say(f"DONE {self._label}: {artefact.directory}")
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        self._close_live()
+
+    def _draw(self, done: int, total: int, detail: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+        from rich.table import Column
+
+        if self._live is None:
+            self._live = Progress(
+                BarColumn(bar_width=12),
+                TaskProgressColumn(),
+                TextColumn(
+                    "{task.fields[detail]}",
+                    markup=False,
+                    table_column=Column(no_wrap=True, overflow="ellipsis"),
+                ),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self._task = self._live.add_task("", total=total, detail=detail)
+            self._live.start()
+        self._live.update(self._task, completed=done, total=total, detail=detail)
+
+    def _close_live(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _say(self, text: str) -> None:
+        if not self._quiet:
+            self._print(text)
+
+    def _print(self, text: str, style: str = "") -> None:
+        if self._live is not None:
+            self._live.console.print(text, style=style, markup=False, highlight=False)
+        elif style and sys.stderr.isatty() and "NO_COLOR" not in os.environ:
+            print(f"\x1b[1;33m{text}\x1b[0m", file=sys.stderr, flush=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+
+def print_data(text: str) -> None:
+    """One line of data on stdout."""
+    print(text, flush=True)
+
+
+def print_json(kind: str, value: Mapping[str, Any]) -> None:
+    """One JSON document on stdout, with the version of its form."""
+    print(json.dumps({"version": JSON_VERSION, "kind": kind, **value}, sort_keys=True), flush=True)
+
+
+def print_table(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", stderr: bool = False
+) -> None:
+    """A table for people; plain text with aligned columns where the stream is no terminal."""
+    stream = sys.stderr if stderr else sys.stdout
+    if not stream.isatty():
+        widths = [max(len(str(r[i])) for r in [columns, *rows]) for i in range(len(columns))]
+        lines = [title] if title else []
+        for row in [columns, *rows]:
+            cells = (str(c).ljust(w) for c, w in zip(row, widths, strict=True))
+            lines.append("  ".join(cells).rstrip())
+        print("\n".join(lines), file=stream, flush=True)
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title or None, title_justify="left")
+    for column in columns:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*(Text(str(cell)) for cell in row))
+    Console(stderr=stderr).print(table)
+
+
+def print_error(error: IrlError, as_json: bool) -> None:
+    """One line and its hint on stderr; with ``--json`` a document on stdout too."""
+    if as_json:
+        print_json(
+            "error",
+            {"message": error.message, "hint": error.hint, "exit_code": error.exit_code},
+        )
+    print(f"error: {error.message}", file=sys.stderr)
+    if error.hint:
+        print(f"hint: {error.hint}", file=sys.stderr)
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
+def _summary_writer(directory: Path):
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise UsageError(
+            "--tensorboard needs the package tensorboard", "pip install 'irlcli[tensorboard]'"
+        ) from None
+    return SummaryWriter(str(directory))

@@ -1,0 +1,230 @@
+"""Demonstrations as Parquet: ``steps.parquet`` and ``episodes.parquet`` (design: Demonstrations).
+
+One row group per episode, zstd, page checksums. The key-value metadata holds the schema's
+version, the environment and the experts' digests; no times and no paths, so equal
+demonstrations are equal bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from irlcli.errors import IntegrityError
+from irlcli.interventions import Setting
+from irlcli.trajectories import Trajectory
+
+SCHEMA = 1
+STEPS = "steps.parquet"
+EPISODES = "episodes.parquet"
+_METADATA_KEY = b"irlcli"
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Trajectories by setting (printed form), in the order collected, with their origin."""
+
+    env: str
+    trajectories: Mapping[str, tuple[Trajectory, ...]]
+    metadata: Mapping[str, Any]
+
+
+def write_table(table: pa.Table, path: Path, row_group_size: int | None = None) -> None:
+    """Write one Parquet file in the project's form: zstd, page checksums, no nulls."""
+    pq.write_table(
+        table,
+        path,
+        compression="zstd",
+        write_page_checksum=True,
+        row_group_size=row_group_size or max(1, table.num_rows),
+    )
+
+
+def write_demonstrations(
+    directory: Path,
+    env: str,
+    groups: Sequence[tuple[Setting, Sequence[Trajectory]]],
+    metadata: Mapping[str, Any],
+) -> None:
+    """Write ``groups`` of trajectories into ``directory``.
+
+    Raises:
+        OSError: the directory cannot be written.
+        ValueError: no trajectory, or trajectories of different shapes.
+    """
+    episodes = [(setting, t) for setting, group in groups for t in group]
+    if not episodes:
+        raise ValueError("there is no trajectory to write")
+    first = episodes[0][1]
+    tags = {"schema": SCHEMA, "env": env, **metadata}
+    schema = _steps_schema(
+        first.observations.shape[1], None if first.actions.ndim == 1 else first.actions.shape[1]
+    ).with_metadata({_METADATA_KEY: json.dumps(tags, sort_keys=True).encode()})
+    with pq.ParquetWriter(
+        directory / STEPS, schema, compression="zstd", write_page_checksum=True
+    ) as writer:
+        for index, (_, trajectory) in enumerate(episodes):
+            writer.write_table(_steps_table(schema, index, trajectory), row_group_size=2**30)
+    rows = [_episode_row(i, setting, t) for i, (setting, t) in enumerate(episodes)]
+    table = pa.Table.from_pylist(rows, schema=_episodes_schema(first.observations.shape[1]))
+    write_table(table.replace_schema_metadata(schema.metadata), directory / EPISODES)
+
+
+def _steps_schema(observation_size: int, action_size: int | None) -> pa.Schema:
+    action = pa.int64() if action_size is None else pa.list_(pa.float32(), action_size)
+    return pa.schema(
+        [
+            pa.field("episode", pa.int32(), nullable=False),
+            pa.field("t", pa.int32(), nullable=False),
+            pa.field("obs", pa.list_(pa.float32(), observation_size), nullable=False),
+            pa.field("action", action, nullable=False),
+            pa.field("reward", pa.float64(), nullable=False),
+        ]
+    )
+
+
+def _episodes_schema(observation_size: int) -> pa.Schema:
+    return pa.schema(
+        [
+            pa.field("episode", pa.int32(), nullable=False),
+            pa.field("setting", pa.string(), nullable=False),
+            pa.field("intervention", pa.list_(pa.float64()), nullable=False),
+            pa.field("seed", pa.int64(), nullable=False),
+            pa.field("length", pa.int32(), nullable=False),
+            pa.field("return", pa.float64(), nullable=False),
+            pa.field("terminated", pa.bool_(), nullable=False),
+            pa.field("truncated", pa.bool_(), nullable=False),
+            pa.field("final_obs", pa.list_(pa.float32(), observation_size), nullable=False),
+        ]
+    )
+
+
+def _steps_table(schema: pa.Schema, index: int, trajectory: Trajectory) -> pa.Table:
+    steps, size = len(trajectory), trajectory.observations.shape[1]
+    action_type = schema.field("action").type
+    actions = pa.array(trajectory.actions.ravel())
+    if not pa.types.is_integer(action_type):
+        actions = pa.FixedSizeListArray.from_arrays(actions, action_type.list_size)
+    columns = [
+        pa.array(np.full(steps, index, dtype=np.int32)),
+        pa.array(np.arange(steps, dtype=np.int32)),
+        pa.FixedSizeListArray.from_arrays(pa.array(trajectory.observations[:-1].ravel()), size),
+        actions,
+        pa.array(trajectory.rewards),
+    ]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _episode_row(index: int, setting: Setting, trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "episode": index,
+        "setting": str(setting),
+        "intervention": [] if setting.value is None else list(setting.value.numbers),
+        "seed": trajectory.seed,
+        "length": len(trajectory),
+        "return": trajectory.episode_return,
+        "terminated": trajectory.terminated,
+        "truncated": trajectory.truncated,
+        "final_obs": trajectory.observations[-1],
+    }
+
+
+def read_metadata(directory: Path) -> dict[str, Any]:
+    """The key-value metadata of the demonstrations in ``directory``; reads only the footer.
+
+    Raises:
+        IntegrityError: no demonstrations, damaged ones, or of a newer schema.
+    """
+    path = directory / EPISODES
+    try:
+        with pq.ParquetFile(path) as file:
+            tags = json.loads((file.schema_arrow.metadata or {})[_METADATA_KEY])
+        version, env = tags["schema"], tags["env"]
+        if type(version) is not int or not isinstance(env, str):
+            raise ValueError("its metadata is malformed")
+    except FileNotFoundError:
+        raise IntegrityError(
+            f"{directory} holds no demonstrations: {EPISODES} is missing"
+        ) from None
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError) as error:
+        raise IntegrityError(
+            f"{path} is not a demonstrations file ({_first_line(error)})",
+            "demonstrations come from `irl collect-experts`",
+        ) from None
+    if version > SCHEMA:
+        raise IntegrityError(
+            f"{path} has schema {version}, newer than the {SCHEMA} known here",
+            "it was written by a newer irlcli: upgrade this one",
+        )
+    return tags
+
+
+def read_demonstrations(directory: Path) -> Demonstrations:
+    """The demonstrations in ``directory``, every trajectory validated.
+
+    Raises:
+        IntegrityError: missing, truncated, of another form, or inconsistent.
+    """
+    tags = read_metadata(directory)
+    try:
+        episodes = pq.read_table(directory / EPISODES, page_checksum_verification=True)
+        steps = pq.read_table(directory / STEPS, page_checksum_verification=True)
+        trajectories = _parse(steps, episodes.to_pylist())
+    except FileNotFoundError as error:
+        raise IntegrityError(f"{error.filename or STEPS} is missing in {directory}") from None
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError) as error:
+        raise IntegrityError(
+            f"the demonstrations in {directory} are damaged ({_first_line(error)})"
+        ) from None
+    return Demonstrations(tags["env"], trajectories, tags)
+
+
+def _parse(steps: pa.Table, episodes: list[dict]) -> dict[str, tuple[Trajectory, ...]]:
+    episode_of_step = steps["episode"].to_numpy()
+    observations = _matrix(steps["obs"])
+    action_column = steps["action"]
+    discrete = pa.types.is_integer(action_column.type)
+    actions = action_column.to_numpy() if discrete else _matrix(action_column)
+    rewards = steps["reward"].to_numpy()
+    if not np.array_equal(
+        episode_of_step, np.repeat(np.arange(len(episodes)), [e["length"] for e in episodes])
+    ):
+        raise ValueError("steps and episodes do not fit each other")
+    groups: dict[str, list[Trajectory]] = {}
+    start = 0
+    for episode in episodes:
+        stop = start + episode["length"]
+        final = np.asarray(episode["final_obs"], dtype=np.float32)
+        trajectory = Trajectory(
+            observations=np.vstack([observations[start:stop], final]),
+            actions=np.array(actions[start:stop]),
+            rewards=np.array(rewards[start:stop]),
+            terminated=episode["terminated"],
+            truncated=episode["truncated"],
+            seed=episode["seed"],
+        )
+        if trajectory.episode_return != episode["return"]:
+            raise ValueError(f"episode {episode['episode']} does not add up to its return")
+        groups.setdefault(episode["setting"], []).append(trajectory)
+        start = stop
+    return {setting: tuple(group) for setting, group in groups.items()}
+
+
+def _matrix(column: pa.ChunkedArray) -> np.ndarray:
+    flat = column.combine_chunks()
+    if isinstance(flat, pa.ChunkedArray):
+        flat = flat.chunk(0)
+    if flat.null_count:
+        raise ValueError("a column holds nulls")
+    return flat.flatten().to_numpy().reshape(len(column), -1)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,0 +1,96 @@
+"""What a reference given to ``--demos``, ``--reward`` or ``--policy`` stands for.
+
+Planning needs to know the environment and the settings behind it. Inside the store a JSON
+output says so and no tensor library is loaded; a foreign file is opened and asked.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from irlcli.errors import IntegrityError, NotFound, UsageError
+from irlcli.runner import source_of
+from irlcli.stages import Source
+from irlcli.store import Artefact, Resolved, Store, read_json
+
+
+def tensor_file(store: Store, ref: str, kind: str) -> tuple[Source, dict[str, Any]]:
+    """The ``reward`` or ``policy`` that ``ref`` names, and its description.
+
+    A reference to a whole artefact stands for its file of that kind.
+
+    Raises:
+        NotFound: no such thing, or an artefact without one.
+        UsageError: a tensor file of the other kind.
+        IntegrityError: damaged, foreign or hostile.
+    """
+    resolved = store.resolve(ref)
+    artefact = resolved.artefact
+    if artefact is None:
+        from irlcli.checkpoints import load
+
+        path = resolved.path / f"{kind}.pt" if resolved.path.is_dir() else resolved.path
+        if not path.exists():
+            raise NotFound(f"{resolved.path} holds no {kind}.pt", f"name a {kind} file")
+        description, _ = load(path, kind)
+        return source_of(Resolved(None, path)), description
+    output = resolved.output or _only(artefact, f"{kind}.pt")
+    if output != f"{kind}.pt":
+        raise UsageError(
+            f"{ref!r} is {output}, not a {kind}", f"name {artefact.id}/{kind}.pt or the artefact"
+        )
+    source = source_of(Resolved(artefact, artefact.directory / output))
+    return source, read_json(store.open(artefact, f"{kind}.json"))
+
+
+def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
+    """The dataset that ``ref`` names, its environment and its settings.
+
+    Raises:
+        NotFound: no such thing.
+        UsageError: something else than demonstrations.
+        IntegrityError: damaged or foreign.
+    """
+    resolved = store.resolve(ref)
+    artefact = resolved.artefact
+    if artefact is None:
+        from irlcli.dataset import read_demonstrations
+
+        demos = read_demonstrations(Path(ref))
+        return source_of(resolved), demos.env, list(demos.trajectories)
+    record = artefact.manifest.record
+    if record.stage != "collect-experts" or resolved.output is not None:
+        what = resolved.output or f"a {record.stage} artefact"
+        raise UsageError(
+            f"{ref!r} is {what}, not a dataset of demonstrations",
+            "name an artefact that `irl collect-experts` made",
+        )
+    return source_of(resolved), record.parameters["env"], list(record.parameters["settings"])
+
+
+def evaluation(store: Store, ref: str) -> tuple[Artefact, dict[str, Any]]:
+    """The evaluation that ``ref`` names and its summary.
+
+    Raises:
+        NotFound: no such thing.
+        UsageError: no evaluation.
+        IntegrityError: damaged.
+    """
+    artefact = store.resolve(ref).artefact
+    if artefact is None or artefact.manifest.record.stage != "evaluate":
+        raise UsageError(f"{ref!r} is no evaluation", "name artefacts that `irl evaluate` made")
+    summary = read_json(store.open(artefact, "summary.json"))
+    if not isinstance(summary, dict):
+        raise IntegrityError(f"{ref!r} has no readable summary")
+    return artefact, summary
+
+
+def _only(artefact: Artefact, name: str) -> str:
+    names = [o.path for o in artefact.manifest.outputs]
+    if name not in names:
+        raise NotFound(
+            f"artefact {artefact.id} ({artefact.manifest.record.stage}) holds no {name}",
+            f"it holds: {', '.join(names)}",
+        )
+    return name

@@ -1,0 +1,56 @@
+"""True returns of evaluations, side by side: who acted, where, and how it varies over seeds."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+_ORDER = ("expert", "student", "transfer", "random", "idle")
+_WHAT = {"student": "zero-shot", "transfer": "transfer"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One agent in one setting; the sample of the statistics is the seed, not the episode."""
+
+    agent: str
+    env: str
+    setting: str
+    returns: tuple[float, ...]  # mean true return of each seed
+    episodes: int  # per seed
+
+    @property
+    def mean(self) -> float:
+        """Mean over seeds."""
+        return statistics.fmean(self.returns)
+
+    @property
+    def deviation(self) -> float | None:
+        """Standard deviation over seeds; None for one seed."""
+        return statistics.stdev(self.returns) if len(self.returns) > 1 else None
+
+
+def rows(summaries: Iterable[Mapping[str, Any]]) -> list[Row]:
+    """Rows of evaluation summaries (``summary.json``), one per agent, method and setting.
+
+    Experts first, random and idle last.
+    """
+    groups: dict[tuple[int, str, str, str], list[tuple[float, int]]] = {}
+    for summary in summaries:
+        policy = summary["policy"]
+        order = _ORDER.index(policy["agent"])
+        for item in summary["settings"]:
+            key = (order, agent_name(policy), policy["env"], item["setting"])
+            groups.setdefault(key, []).append((item["mean_return"], item["episodes"]))
+    return [
+        Row(agent, env, setting, tuple(r for r, _ in items), min(n for _, n in items))
+        for (_, agent, env, setting), items in sorted(groups.items())
+    ]
+
+
+def agent_name(policy: Mapping[str, Any]) -> str:
+    """``expert``, ``airl-irm transfer``, ``airl-erm zero-shot``, ``random``, ``idle``."""
+    agent = policy["agent"]
+    return f"airl-{policy['method']} {_WHAT[agent]}" if agent in _WHAT else agent

@@ -1,0 +1,342 @@
+"""Plan, run, resume, publish: from a request to an artefact.
+
+``Runner(store).run(request)`` is all there is to the Python API; the command line does the same.
+"""
+
+import hashlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from irlcli.errors import Interrupted, StageFailed, UsageError
+from irlcli.stages import Console, From, Job, Request, Source
+from irlcli.store import (
+    Artefact,
+    KeyRecord,
+    Resolved,
+    Scratch,
+    Store,
+    content_digest,
+    directory_outputs,
+    file_digest,
+)
+
+CHECKPOINT_SECONDS = 10.0
+_LIBRARIES = ("torch", "numpy", "stable-baselines3", "gymnasium", "Box2D", "pyarrow", "msgspec")
+
+Status = Literal["HIT", "RUN", "RESUME", "BLOCKED"]
+
+
+class Silent(Console):
+    """A console that shows nothing, for use from Python; any other has the same methods."""
+
+    def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
+        pass
+
+    def warn(self, message: str) -> None:
+        pass
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        pass
+
+    def start(self, label: str, resumed: bool) -> None:
+        pass
+
+    def finish(self, artefact: Artefact, hit: bool) -> None:
+        pass
+
+    def wait(self, label: str, holder: str) -> None:
+        pass
+
+
+class Step(NamedTuple):
+    """One line of a plan: what would happen to a request, and why."""
+
+    status: Status
+    label: str
+    why: str
+    artefact: Artefact | None = None
+
+
+class Runner:
+    """Turns requests into artefacts of one store.
+
+    Args:
+        store: a store or its directory.
+        console: told of progress; silent by default.
+        wait: wait for another process that makes the same artefact, instead of failing.
+        command: the command line to record; ``sys.argv`` by default.
+        checkpoint_seconds: least time between two checkpoints [s].
+    """
+
+    def __init__(
+        self,
+        store: Store | Path | str,
+        console: Any = None,
+        wait: bool = True,
+        command: list[str] | None = None,
+        checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    ):
+        self.store = store if isinstance(store, Store) else Store(store)
+        self.console = console if console is not None else Silent()
+        self.wait = wait
+        self.command = command if command is not None else ["irl", *sys.argv[1:]]
+        self.checkpoint_seconds = checkpoint_seconds
+
+    def plan(self, request: Request) -> list[Step]:
+        """What :meth:`run` would do, inputs first; nothing is computed or written."""
+        steps: dict[tuple[str, str], Step] = {}
+        self._plan(request, steps)
+        return list(steps.values())
+
+    def _plan(self, request: Request, steps: dict[tuple[str, str], Step]) -> Step:
+        inputs: dict[str, str] = {}
+        missing = []
+        for role, source in request.inputs.items():
+            if isinstance(source, Source):
+                inputs[role] = source.sha256
+                continue
+            step = self._plan(source.request, steps)
+            if step.artefact is None:
+                missing.append(step.label)
+            else:
+                inputs[role] = _source(step.artefact, source.output).sha256
+        if missing:
+            step = Step("BLOCKED", request.label, f"waits for {', '.join(missing)}")
+        else:
+            step = self._plan_ready(request, self._record(request, inputs))
+        steps.setdefault((request.stage.name, request.label), step)
+        return step
+
+    def _plan_ready(self, request: Request, record: KeyRecord) -> Step:
+        artefact = self.store.find(record.key)
+        if artefact is not None:
+            return Step("HIT", request.label, f"{artefact.directory}", artefact)
+        if self.store.has_checkpoint(record.key):
+            return Step("RESUME", request.label, "an interrupted run left a checkpoint")
+        return Step("RUN", request.label, f"no artefact has the key {record.key[:12]}")
+
+    def run(self, request: Request) -> Artefact:
+        """The artefact of ``request``: found, or made after everything it needs.
+
+        Raises:
+            StageFailed: the stage could not finish, or the disk is full or not writable.
+            IntegrityError: an input is damaged.
+            Busy: another process works on it and this runner does not wait.
+            Interrupted: a signal asked to stop; the checkpoint has been saved.
+        """
+        sources: dict[str, Source] = {}
+        for role, source in request.inputs.items():
+            if isinstance(source, From):
+                source = _source(self.run(source.request), source.output)
+            sources[role] = source
+        record = self._record(request, {role: s.sha256 for role, s in sources.items()})
+        artefact = self.store.find(record.key)
+        if artefact is None:
+            try:
+                artefact = self._make(request, record, sources)
+            except OSError as error:
+                raise StageFailed(
+                    f"{request.label}: {error.strerror or error}"
+                    + (f": {error.filename}" if error.filename else ""),
+                    "nothing was published and the checkpoint is kept: mend the cause and run "
+                    "the same command again",
+                ) from error
+        else:
+            self.console.finish(artefact, hit=True)
+        return artefact
+
+    def _record(self, request: Request, inputs: Mapping[str, str]) -> KeyRecord:
+        parameters = msgspec.to_builtins(request.parameters)
+        return KeyRecord(request.stage.name, request.stage.version, parameters, dict(inputs))
+
+    def _make(self, request: Request, record: KeyRecord, sources: Mapping[str, Source]) -> Artefact:
+        self.store.create()
+
+        def on_wait(holder: str) -> None:
+            self.console.wait(request.label, holder)
+
+        with (
+            self.store.in_use(),
+            self.store.working_on(record.key, self.wait, on_wait) as scratch,
+        ):
+            # The process that held the lock may have made it.
+            artefact = self.store.find(record.key)
+            if artefact is not None:
+                self.console.finish(artefact, hit=True)
+                return artefact
+            inputs = {role: self._checked(source) for role, source in sources.items()}
+            checkpoints = _Checkpoints(scratch, self.console, self.checkpoint_seconds)
+            self.console.start(request.label, checkpoints.load() is not None)
+            output = scratch.new_output()
+            started = time.time()
+            with checkpoints.listening():
+                request.stage.run(
+                    Job(request.parameters, inputs, output, checkpoints, self.console)
+                )
+            provenance = self._provenance(sources, started, checkpoints.resumed)
+            published = self.store.publish(record, output, provenance)
+        if published.diverged is not None:
+            self.console.warn(
+                f"{request.label} gave other bytes than {published.diverged.id}, which holds the "
+                f"key: this result is kept as {published.artefact.id}"
+            )
+        self.console.finish(published.artefact, hit=False)
+        return published.diverged or published.artefact
+
+    def _checked(self, source: Source) -> Path:
+        """The path of an input whose bytes are what the key says."""
+        if source.artefact is None:
+            return source.path
+        if source.path != source.artefact.directory:
+            relative = source.path.relative_to(source.artefact.directory).as_posix()
+            return self.store.open(source.artefact, relative)
+        for output in source.artefact.manifest.outputs:
+            self.store.open(source.artefact, output.path)
+        return source.path
+
+    def _provenance(
+        self, sources: Mapping[str, Source], started: float, resumed: int
+    ) -> dict[str, Any]:
+        # Imported here and below: a hit does without, and they take longer than it does.
+        import platform
+
+        return {
+            "command": self.command,
+            "git": _git_state(),
+            "libraries": {name: _version(name) for name in ("irlcli", *_LIBRARIES)},
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "device": "cpu",
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
+            "seconds": round(time.time() - started, 3),
+            "resumed": resumed,
+            "inputs": {
+                role: f"{s.artefact.id}/{s.path.relative_to(s.artefact.directory)}"
+                if s.artefact
+                else str(s.path)
+                for role, s in sources.items()
+            },
+        }
+
+
+class _Checkpoints:
+    """A stage's checkpoints: throttled by time, and where a stop signal is answered."""
+
+    def __init__(self, scratch: Scratch, console: Any, seconds: float):
+        self._scratch = scratch
+        self._console = console
+        self._seconds = seconds
+        self._last = time.monotonic()
+        self._stop = False
+        self._state: bytes | None = None
+        self.resumed = 0
+        try:
+            stored = scratch.load()
+        except ValueError as error:
+            console.warn(f"{error}: starting over")
+            scratch.discard_checkpoint()
+            stored = None
+        if stored is not None:
+            self.resumed = int.from_bytes(stored[:4], "big") + 1
+            self._state = stored[4:]
+
+    def load(self) -> bytes | None:
+        return self._state
+
+    def offer(self, state: Callable[[], bytes]) -> None:
+        now = time.monotonic()
+        if self._stop or now - self._last >= self._seconds:
+            self._scratch.save(self.resumed.to_bytes(4, "big") + state())
+            self._last = now
+        if self._stop:
+            raise Interrupted(
+                "stopped; a checkpoint was written", "run the same command again to go on from it"
+            )
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Let SIGINT and SIGTERM ask for a stop at the end of the round; a second one insists."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def handle(number: int, frame: Any) -> None:
+            if self._stop:
+                raise KeyboardInterrupt
+            self._stop = True
+            self._console.warn("stopping at the end of this round (once more to stop at once)")
+
+        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+
+def source_of(resolved: Resolved) -> Source:
+    """A resolved reference as a stage's input.
+
+    Raises:
+        UsageError: a foreign directory without files, or one that cannot be read.
+    """
+    if resolved.artefact is not None:
+        return _source(resolved.artefact, resolved.output)
+    try:
+        if resolved.path.is_file():
+            return Source(resolved.path, file_digest(resolved.path))
+        outputs = directory_outputs(resolved.path)
+        if not outputs:
+            raise UsageError(f"{resolved.path} holds no files", "name a file or an artefact")
+        return Source(resolved.path, content_digest(outputs))
+    except OSError as error:
+        raise UsageError(f"{resolved.path} cannot be read ({error.strerror})") from None
+
+
+def _source(artefact: Artefact, output: str | None) -> Source:
+    if output is None:
+        return Source(artefact.directory, artefact.manifest.content, artefact)
+    return Source(artefact.directory / output, artefact.output(output).sha256, artefact)
+
+
+def _version(library: str) -> str | None:
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git_state() -> dict[str, str | None]:
+    """Commit of the checkout this package runs from, and a digest of what is not committed."""
+    import shutil
+    import subprocess
+
+    here = Path(__file__).parent
+    if shutil.which("git") is None:
+        return {"commit": None, "dirty": None}
+
+    def git(*arguments: str) -> bytes | None:
+        done = subprocess.run(
+            ["git", "-C", str(here), *arguments],
+            capture_output=True,
+            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
+        )
+        return done.stdout if done.returncode == 0 else None
+
+    commit = git("rev-parse", "HEAD")
+    if commit is None or git("ls-files", "--error-unmatch", __file__) is None:
+        return {"commit": None, "dirty": None}
+    changes = git("diff", "HEAD", "--", str(here))
+    dirty = hashlib.sha256(changes).hexdigest()[:16] if changes else None
+    return {"commit": commit.decode().strip(), "dirty": dirty}

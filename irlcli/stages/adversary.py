@@ -1,0 +1,251 @@
+"""The learning opponent of train-airl: rollouts and demonstrations in, rewards out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from irlcli import checkpoints
+from irlcli.dataset import Demonstrations
+from irlcli.envs.vector import VectorWorlds
+from irlcli.errors import IntegrityError, StageFailed
+from irlcli.interventions import environment
+from irlcli.irl import airl
+from irlcli.irl.networks import RewardModel
+from irlcli.rl import Policy, Rollout, world_groups
+from irlcli.settings import AIRLSettings
+from irlcli.stages.outputs import write_json
+from irlcli.trajectories import Transitions, join, transitions
+
+
+class Adversary:
+    """Discriminator, its optimiser and the demonstrations.
+
+    ERM pools every setting's transitions into one group (by count, as they come); ERM-balanced
+    and IRM keep one group per setting, each of equal weight.
+
+    Args:
+        demos: demonstrations; their settings are the groups.
+        config: AIRL settings.
+        worlds: where the policy acts; equal shares of each setting, setting-major.
+        seed: initialisation and every minibatch derive from it.
+
+    Raises:
+        IntegrityError: the demonstrations' observations are not the environment's.
+    """
+
+    def __init__(
+        self, demos: Demonstrations, config: AIRLSettings, worlds: VectorWorlds, seed: int
+    ):
+        self.config = config
+        self._horizon = environment(demos.env).max_episode_steps
+        self._seed = seed
+        self._expert = [transitions(group, self._horizon) for group in demos.trajectories.values()]
+        size = worlds.observation_space.shape[0]
+        if self._expert[0].observations.shape[1] != size:
+            raise IntegrityError(
+                f"the demonstrations have observations of size "
+                f"{self._expert[0].observations.shape[1]}, {demos.env} has {size}"
+            )
+        discrete = isinstance(worlds.action_space, gymnasium.spaces.Discrete)
+        self._network = {
+            "observation_size": size,
+            "action_size": int(worlds.action_space.n) if discrete else worlds.action_space.shape[0],
+            "discrete": discrete,
+            "state_only": config.state_only,
+            "hidden": list(config.hidden),
+            "activation": config.activation,
+            "gamma": config.ppo.gamma,
+        }
+        torch.manual_seed(self._derived_seed(0))
+        self.model = RewardModel(**self._network)
+        self._optimizer = torch.optim.Adam(
+            self.model.parameters(),
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            fused=True,
+        )
+        self._scale = 1.0
+        self._past: list[Transitions] = []
+        for data in self._expert:
+            self.model.normaliser.update(torch.as_tensor(data.observations))
+
+    def reward(self, rollout: Rollout) -> np.ndarray:
+        """The policy's rewards [T, N] for one rollout, by the present discriminator."""
+        data = rollout_transitions(rollout, slice(None), self._horizon)
+        reward = airl.policy_reward(
+            self.model,
+            data,
+            torch.as_tensor(rollout.log_probs.ravel()),
+            self.config.policy_reward,
+            self.config.fixed_horizon,
+            self.config.ppo.gamma,
+        )
+        return reward.numpy().reshape(rollout.terminated.shape)
+
+    def train_round(
+        self, index: int, rollouts: Sequence[Rollout], policy: Policy
+    ) -> list[dict[str, float]]:
+        """One discriminator round on this round's rollouts; diagnostics per setting.
+
+        Raises:
+            StageFailed: the discriminator's parameters stopped being finite.
+        """
+        config = self.config
+        data = self._by_setting(rollouts)
+        self.model.normaliser.update(
+            torch.as_tensor(np.concatenate([d.observations for d in data]))
+        )
+        policy_pools = [self._pool(d, policy) for d in data]
+        expert_pools = [self._pool(d, policy) for d in self._expert]
+        past_pools = [self._pool(d, policy) for d in self._past]
+        groups = self._grouped(policy_pools, expert_pools, past_pools)
+        weight = 0.0
+        if config.method == "irm":
+            weight = airl.penalty_weight_at(
+                index,
+                config.penalty_weight,
+                config.penalty_warmup_rounds,
+                config.penalty_ramp_rounds,
+            )
+        # Every method sees as many samples per update.
+        size = config.batch_size * len(expert_pools) // len(groups[0])
+        generator = torch.Generator().manual_seed(self._derived_seed(index + 1))
+        for _ in range(config.updates_per_round):
+            batch = airl.sample_minibatch(
+                groups[0], groups[1], size, generator, groups[2], config.replay_share
+            )
+            losses = self._losses(batch, weight)
+            self._optimizer.zero_grad()
+            losses.total.backward()
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
+            self._optimizer.step()
+        if not all(bool(torch.isfinite(p).all()) for p in self.model.parameters()):
+            raise StageFailed(
+                f"the discriminator's parameters are not finite after round {index}",
+                "a smaller airl.learning_rate or airl.penalty_weight usually helps",
+            )
+        self._remember(data, index)
+        self._scale = airl.reward_scale(self.model, [*policy_pools, *expert_pools])
+        # Per setting whatever the method pools, so that methods can be compared.
+        with torch.no_grad():
+            batch = airl.sample_minibatch(policy_pools, expert_pools, 1024, generator)
+            return _diagnostics(self._losses(batch, weight), weight)
+
+    def _derived_seed(self, index: int) -> int:
+        return int(np.random.SeedSequence([self._seed, index, 1]).generate_state(1)[0])
+
+    def _by_setting(self, rollouts: Sequence[Rollout]) -> list[Transitions]:
+        groups = world_groups(rollouts[0].terminated.shape[1], len(self._expert))
+        return [
+            join([rollout_transitions(r, groups == e, self._horizon) for r in rollouts])
+            for e in range(len(self._expert))
+        ]
+
+    def _pool(self, data: Transitions, policy: Policy) -> airl.Pool:
+        log_probs = policy.log_prob(
+            torch.as_tensor(data.observations), torch.as_tensor(data.actions)
+        )
+        return airl.make_pool(self.model, data, log_probs, self.config.fixed_horizon)
+
+    def _grouped(
+        self, policy: list[airl.Pool], expert: list[airl.Pool], past: list[airl.Pool]
+    ) -> tuple[list[airl.Pool], list[airl.Pool], list[airl.Pool]]:
+        """Policy, expert and past pools of each group that has a loss of its own."""
+
+        def pooled(pools: list[airl.Pool], copies: int) -> list[airl.Pool]:
+            return [airl.join_pools(pools)] * copies if pools else []
+
+        if self.config.method == "erm":
+            return pooled(policy, 1), pooled(expert, 1), pooled(past, 1)
+        if self.config.pairing == "pooled":
+            return pooled(policy, len(expert)), expert, pooled(past, len(expert))
+        return policy, expert, past
+
+    def _remember(self, data: Sequence[Transitions], index: int) -> None:
+        """Keep a uniform sample of this round; thin the past where it outgrows its capacity."""
+        rng = np.random.default_rng(np.random.SeedSequence([self._seed, index, 2]))
+        config = self.config
+        if config.replay_share == 0.0:
+            return
+        kept = [
+            d.take(rng.choice(len(d), min(config.replay_per_round, len(d)), replace=False))
+            for d in data
+        ]
+        if self._past:
+            kept = [join(pair) for pair in zip(self._past, kept, strict=True)]
+        self._past = [
+            d
+            if len(d) <= config.replay_capacity
+            else d.take(np.sort(rng.choice(len(d), config.replay_capacity, replace=False)))
+            for d in kept
+        ]
+
+    def _losses(self, batch: airl.Minibatch, weight: float) -> airl.Losses:
+        logit, f = airl.logits(self.model, batch)
+        unbiased = self.config.penalty_estimate == "unbiased"
+        return airl.discriminator_losses(logit, f, weight, self.config.penalty_scaling, unbiased)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a later process needs to go on from the end of the last round."""
+        return {
+            "model": self.model.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "scale": self._scale,
+            "past": [
+                {f.name: torch.as_tensor(getattr(d, f.name)) for f in fields(Transitions)}
+                for d in self._past
+            ],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from ``state_dict()`` of an equally configured adversary."""
+        self.model.load_state_dict(state["model"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._scale = state["scale"]
+        self._past = [
+            Transitions(**{name: tensor.numpy() for name, tensor in d.items()})
+            for d in state["past"]
+        ]
+
+    def write_reward(self, directory: Path, origin: Mapping[str, Any]) -> None:
+        """Write ``reward.pt`` and, for readers without torch, ``reward.json``."""
+        description = {**origin, "network": self._network, "scale": self._scale}
+        checkpoints.save(directory / "reward.pt", "reward", description, self.model.state_dict())
+        write_json(directory / "reward.json", description)
+
+
+def rollout_transitions(rollout: Rollout, worlds: np.ndarray | slice, horizon: int) -> Transitions:
+    """The transitions [T * n] of some of a rollout's worlds, time-major."""
+
+    def flat(array: np.ndarray) -> np.ndarray:
+        chosen = array[:, worlds]
+        return chosen.reshape(-1, *chosen.shape[2:])
+
+    terminated = flat(rollout.terminated)
+    return Transitions(
+        observations=flat(rollout.observations),
+        actions=flat(rollout.actions),
+        next_observations=flat(rollout.next_observations),
+        terminated=terminated,
+        remaining=np.where(terminated, horizon - flat(rollout.lengths), 0),
+    )
+
+
+def _diagnostics(losses: airl.Losses, weight: float) -> list[dict[str, float]]:
+    return [
+        {
+            "cross_entropy": float(losses.cross_entropy[e]),
+            "accuracy": float(losses.accuracy[e]),
+            "mean_abs_logit": float(losses.mean_abs_logit[e]),
+            "penalty": float(losses.penalty[e]),
+            "penalty_weight": weight,
+        }
+        for e in range(len(losses.penalty))
+    ]

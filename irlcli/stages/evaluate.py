@@ -1,0 +1,99 @@
+"""True return of a policy over whole episodes, in one or more settings."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import msgspec
+
+from irlcli.interventions import Setting, parse_setting
+from irlcli.settings import EvaluationSettings
+from irlcli.stages import From, Job, Request, Source, Stage
+
+Agent = Literal["policy", "random", "idle"]
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What an evaluation depends on, besides the policy."""
+
+    env: str
+    settings: tuple[str, ...]
+    agent: Agent
+    seed: int
+    evaluation: EvaluationSettings
+
+
+def request(
+    env: str,
+    settings_: Sequence[Setting],
+    evaluation: EvaluationSettings,
+    policy: Source | From | None = None,
+    agent: Agent = "policy",
+    seed: int = 0,
+) -> Request:
+    """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``settings_``.
+
+    Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
+    """
+    texts = tuple(str(s) for s in settings_)
+    parameters = Parameters(env=env, settings=texts, agent=agent, seed=seed, evaluation=evaluation)
+    inputs = {} if policy is None else {"policy": policy}
+    label = f"evaluate {agent} {env} {', '.join(texts)} seed {seed}"
+    return Request(STAGE, parameters, inputs, label)
+
+
+def run(job: Job) -> None:
+    """Roll out; episode k starts from the same state for every agent and in every method."""
+    import numpy as np
+    import pyarrow as pa
+
+    from irlcli import rl
+    from irlcli.checkpoints import load_policy_file
+    from irlcli.dataset import write_table
+    from irlcli.stages.outputs import write_json
+
+    p: Parameters = job.parameters
+    policy, origin = p.agent, {"agent": p.agent, "env": p.env}
+    if "policy" in job.inputs:
+        policy, origin = load_policy_file(job.inputs["policy"])
+    rows, summary = [], []
+    for index, text in enumerate(p.settings):
+        seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
+        trajectories = rl.roll_out(
+            p.env,
+            parse_setting(p.env, text),
+            policy,
+            p.evaluation.episodes,
+            seed,
+            p.evaluation.deterministic,
+        )
+        rows += [
+            {
+                "setting": text,
+                "episode": k,
+                "seed": t.seed,
+                "true_return": t.episode_return,
+                "length": len(t),
+                "terminated": t.terminated,
+            }
+            for k, t in enumerate(trajectories)
+        ]
+        returns = np.array([t.episode_return for t in trajectories])
+        summary.append(
+            {
+                "setting": text,
+                "episodes": len(returns),
+                "mean_return": float(returns.mean()),
+                "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
+                "mean_length": float(np.mean([len(t) for t in trajectories])),
+                "terminated": float(np.mean([t.terminated for t in trajectories])),
+            }
+        )
+        job.console.progress(
+            index + 1, len(p.settings), "settings", {text: f"return {returns.mean():.0f}"}
+        )
+    write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
+    subject = {key: value for key, value in origin.items() if key not in ("network", "airl")}
+    write_json(job.output / "summary.json", {"policy": subject, "settings": summary})
+
+
+STAGE = Stage("evaluate", 1, run)

@@ -1,0 +1,114 @@
+"""What the stages that train a policy share: rounds, checkpoints, metrics."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from irlcli import checkpoints
+from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
+from irlcli.stages import Job
+from irlcli.stages.adversary import Adversary
+
+Row = dict[str, Any]
+
+
+def train_rounds(
+    job: Job,
+    trainer: PPOTrainer,
+    settings: Sequence[str],
+    reward: RewardFunction | None = None,
+    adversary: Adversary | None = None,
+) -> list[Row]:
+    """Train from the last checkpoint to the end; returns one row per round and setting.
+
+    The policy is paid by ``adversary``, which learns from every round's rollouts, else by
+    ``reward``, else by the true reward.
+    """
+    first, rows = 0, []
+    if adversary is not None:
+        reward = adversary.reward
+    stored = job.checkpoints.load()
+    if stored is not None:
+        state = checkpoints.from_bytes(stored)
+        trainer.load_state_dict(state["trainer"])
+        if adversary is not None:
+            adversary.load_state_dict(state["adversary"])
+        first, rows = state["round"], json.loads(state["rows"])
+    for index in range(first, trainer.rounds):
+        rollouts = trainer.train_round(index, reward)
+        newest = episode_rows(index, trainer.steps, rollouts, settings)
+        if adversary is not None:
+            for row, diagnostics in zip(
+                newest, adversary.train_round(index, rollouts, trainer.policy), strict=True
+            ):
+                row.update(diagnostics)
+        rows += newest
+        _report(job, trainer, newest)
+        job.checkpoints.offer(partial(_state, trainer, adversary, index + 1, rows))
+    return rows
+
+
+def _state(
+    trainer: PPOTrainer, adversary: Adversary | None, rounds_done: int, rows: Sequence[Row]
+) -> bytes:
+    return checkpoints.to_bytes(
+        {
+            "trainer": trainer.state_dict(),
+            "adversary": adversary.state_dict() if adversary is not None else {},
+            "round": rounds_done,
+            "rows": json.dumps(rows),
+        }
+    )
+
+
+def episode_rows(
+    index: int, steps: int, rollouts: Sequence[Rollout], settings: Sequence[str]
+) -> list[Row]:
+    """One row per setting: true return and length of the episodes that ended in this round.
+
+    A setting in which none ended has NaN, not zero.
+    """
+    groups = world_groups(rollouts[0].terminated.shape[1], len(settings))
+    rows = []
+    for group, setting in enumerate(settings):
+        columns = groups == group
+        ended = np.concatenate([(r.lengths[:, columns] > 0).ravel() for r in rollouts])
+        returns = np.concatenate([r.returns[:, columns].ravel() for r in rollouts])[ended]
+        lengths = np.concatenate([r.lengths[:, columns].ravel() for r in rollouts])[ended]
+        terminated = np.concatenate([r.terminated[:, columns].ravel() for r in rollouts])[ended]
+        rows.append(
+            {
+                "round": index,
+                "steps": steps,
+                "setting": setting,
+                "episodes": int(ended.sum()),
+                "true_return": _mean(returns),
+                "episode_length": _mean(lengths),
+                "terminated": _mean(terminated),
+            }
+        )
+    return rows
+
+
+def _report(job: Job, trainer: PPOTrainer, newest: Sequence[Row]) -> None:
+    facts = {row["setting"]: f"return {row['true_return']:.0f}" for row in newest}
+    if "accuracy" in newest[0]:
+        accuracy = np.mean([row["accuracy"] for row in newest])
+        facts["discriminator"] = f"accuracy {accuracy:.2f}"
+    job.console.progress(trainer.steps, trainer.rounds * trainer.steps_per_round, "steps", facts)
+    scalars = {
+        f"{row['setting']}/{name}": float(value)
+        for row in newest
+        for name, value in row.items()
+        if name not in ("round", "steps", "setting")
+    }
+    job.console.scalars(trainer.steps, scalars)
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")

@@ -1,0 +1,82 @@
+"""Adversarial IRL from demonstrations: ERM, ERM-balanced or IRM (paper Algorithm 1)."""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from irlcli.errors import IntegrityError, UsageError
+from irlcli.interventions import Setting, parse_setting
+from irlcli.settings import AIRLSettings
+from irlcli.stages import From, Job, Request, Source, Stage
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a learned reward depends on, besides its demonstrations."""
+
+    env: str
+    settings: tuple[str, ...]
+    seed: int
+    airl: AIRLSettings
+
+
+def request(
+    demos: Source | From,
+    env: str,
+    settings_: Sequence[Setting],
+    airl: AIRLSettings,
+    seed: int = 0,
+) -> Request:
+    """A reward and a student policy learned from ``demos``, recorded in ``settings_`` of ``env``.
+
+    Outputs ``reward.pt``, ``policy.pt`` (the student), their descriptions as JSON, and
+    ``metrics.parquet`` with one row per round and setting.
+
+    Raises:
+        UsageError: the worlds cannot be shared equally by the settings.
+    """
+    texts = tuple(str(s) for s in settings_)
+    if airl.ppo.n_envs % len(texts):
+        raise UsageError(
+            f"{airl.ppo.n_envs} worlds cannot be shared equally by {len(texts)} settings",
+            f"--set airl.ppo.n_envs to a multiple of {len(texts)}",
+        )
+    parameters = Parameters(env=env, settings=texts, seed=seed, airl=airl)
+    label = f"train-airl {airl.method} {env} {', '.join(texts)} seed {seed}"
+    return Request(STAGE, parameters, {"demonstrations": demos}, label)
+
+
+def run(job: Job) -> None:
+    """Alternate policy rounds and discriminator rounds, all settings together."""
+    from irlcli import rl
+    from irlcli.dataset import read_demonstrations
+    from irlcli.stages.adversary import Adversary
+    from irlcli.stages.outputs import write_metrics, write_policy
+    from irlcli.stages.policy_training import train_rounds
+
+    p: Parameters = job.parameters
+    demos = read_demonstrations(job.inputs["demonstrations"])
+    settings = list(p.settings)
+    if demos.env != p.env or list(demos.trajectories) != settings:
+        raise IntegrityError(
+            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, not of "
+            f"{p.env} {', '.join(settings)}"
+        )
+    worlds = rl.make_worlds(
+        demos.env, [parse_setting(demos.env, s) for s in settings], p.airl.ppo.n_envs
+    )
+    trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
+    adversary = Adversary(demos, p.airl, worlds, p.seed)
+    rows = train_rounds(job, trainer, settings, adversary=adversary)
+    origin = {
+        "env": demos.env,
+        "settings": settings,
+        "method": p.airl.method,
+        "seed": p.seed,
+        "airl": msgspec.to_builtins(p.airl),
+    }
+    write_policy(job.output, trainer.policy, p.airl.ppo, {"agent": "student", **origin})
+    adversary.write_reward(job.output, origin)
+    write_metrics(job.output, rows)
+
+
+STAGE = Stage("train-airl", 1, run)

@@ -1,0 +1,71 @@
+"""A new policy, from random initialisation, on a frozen reward in an unseen setting (Sec. 5.3)."""
+
+import msgspec
+
+from irlcli.interventions import Setting, parse_setting
+from irlcli.settings import TransferSettings
+from irlcli.stages import From, Job, Request, Source, Stage
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a transferred policy depends on, besides the reward."""
+
+    env: str
+    setting: str
+    seed: int
+    transfer: TransferSettings
+
+
+def request(
+    reward: Source | From, env: str, setting: Setting, transfer: TransferSettings, seed: int = 0
+) -> Request:
+    """A policy trained on ``reward`` (a ``reward.pt``) in ``setting``.
+
+    Outputs ``policy.pt``, ``policy.json`` and ``metrics.parquet``.
+    """
+    parameters = Parameters(env=env, setting=str(setting), seed=seed, transfer=transfer)
+    label = f"transfer {env} {setting} seed {seed}"
+    return Request(STAGE, parameters, {"reward": reward}, label)
+
+
+def run(job: Job) -> None:
+    """Train on g / scale; the metrics report the true return, which the policy never sees."""
+    import torch
+
+    from irlcli import rl
+    from irlcli.checkpoints import load_reward_file
+    from irlcli.interventions import environment
+    from irlcli.irl import airl
+    from irlcli.stages.adversary import rollout_transitions
+    from irlcli.stages.outputs import write_metrics, write_policy
+    from irlcli.stages.policy_training import train_rounds
+
+    p: Parameters = job.parameters
+    model, origin = load_reward_file(job.inputs["reward"])
+    ppo = p.transfer.ppo
+    horizon = environment(p.env).max_episode_steps
+    absorbing = origin["airl"]["fixed_horizon"]
+
+    def reward(rollout):
+        data = rollout_transitions(rollout, slice(None), horizon)
+        log_probs = torch.as_tensor(rollout.log_probs.ravel())
+        g = airl.policy_reward(model, data, log_probs, "g", absorbing, ppo.gamma)
+        return (g / origin["scale"]).numpy().reshape(rollout.terminated.shape)
+
+    worlds = rl.make_worlds(p.env, [parse_setting(p.env, p.setting)], ppo.n_envs)
+    trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed)
+    rows = train_rounds(job, trainer, [p.setting], reward)
+    description = {
+        "agent": "transfer",
+        "env": p.env,
+        "settings": [p.setting],
+        "seed": p.seed,
+        "method": origin["method"],
+        "reward_seed": origin["seed"],
+        "reward_settings": origin["settings"],
+    }
+    write_policy(job.output, trainer.policy, ppo, description)
+    write_metrics(job.output, rows)
+
+
+STAGE = Stage("transfer", 1, run)

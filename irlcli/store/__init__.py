@@ -1,0 +1,30 @@
+"""Content-addressed artefacts: digests, manifests, publishing, references, collection."""
+
+from irlcli.store.digest import canonical_json, digest, file_digest
+from irlcli.store.manifest import (
+    KeyRecord,
+    Manifest,
+    Output,
+    content_digest,
+    directory_outputs,
+    read_json,
+)
+from irlcli.store.scratch import Scratch
+from irlcli.store.store import Artefact, Published, Resolved, Store
+
+__all__ = [
+    "Artefact",
+    "KeyRecord",
+    "Manifest",
+    "Output",
+    "Published",
+    "Resolved",
+    "Scratch",
+    "Store",
+    "canonical_json",
+    "content_digest",
+    "digest",
+    "directory_outputs",
+    "file_digest",
+    "read_json",
+]

@@ -1,0 +1,61 @@
+"""Canonical bytes and their sha256: what keys and ids are made of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+_CHUNK = 1 << 20
+
+
+def canonical_json(value: Any) -> bytes:
+    """The one byte string that stands for ``value``: sorted keys, no spaces, ASCII.
+
+    Raises:
+        ValueError: NaN or infinity anywhere (they equal nothing, so no key may hold them).
+        TypeError: anything but dict with string keys, list, tuple, str, int, float, bool, None.
+    """
+    _check(value, "$")
+    return json.dumps(
+        value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False
+    ).encode("ascii")
+
+
+def _check(value: Any, where: str) -> None:
+    kind = type(value)
+    if value is None or kind in (bool, int, str):
+        return
+    if kind is float:
+        if not math.isfinite(value):
+            raise ValueError(f"{where} is {value}, which cannot be part of a key")
+    elif kind in (list, tuple):
+        for i, item in enumerate(value):
+            _check(item, f"{where}[{i}]")
+    elif kind is dict:
+        for key, item in value.items():
+            if type(key) is not str:
+                raise TypeError(f"{where} has the key {key!r}, which is no string")
+            _check(item, f"{where}.{key}")
+    else:
+        raise TypeError(f"{where} is a {type(value).__name__}, which has no canonical form")
+
+
+def digest(value: Any) -> str:
+    """sha256 of ``canonical_json(value)``, 64 hexadecimal digits."""
+    return hashlib.sha256(canonical_json(value)).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file's bytes, read in pieces.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    hasher = hashlib.sha256()
+    with open(path, "rb") as file:
+        while chunk := file.read(_CHUNK):
+            hasher.update(chunk)
+    return hasher.hexdigest()

@@ -1,0 +1,217 @@
+"""What an artefact says of itself: key record, outputs, and where it came from.
+
+``manifest.json`` is hashed: its content follows from the key record and the outputs, and the
+artefact's id is their digest. ``provenance.json`` holds what may differ between equal runs
+(command line, versions, timings); it carries its own checksum and the id it belongs to.
+"""
+
+import json
+import re
+import stat
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+from irlcli.errors import IntegrityError
+from irlcli.store.digest import canonical_json, digest, file_digest
+
+SCHEMA = 1
+MANIFEST = "manifest.json"
+PROVENANCE = "provenance.json"
+_SHA = r"[0-9a-f]{64}"
+# Far above any real one; a larger file is an attack or an accident, and is not parsed.
+_MAX_JSON_BYTES = 16 << 20
+
+
+class KeyRecord(NamedTuple):
+    """Everything that determines a result. ``inputs`` maps a role to the content's sha256."""
+
+    stage: str
+    stage_version: int
+    parameters: dict[str, Any]
+    inputs: dict[str, str]
+
+    @property
+    def key(self) -> str:
+        """sha256 of the record, 64 hexadecimal digits (design: Store, 1)."""
+        return digest(self.as_json())
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "schema": SCHEMA,
+            "stage": self.stage,
+            "stage_version": self.stage_version,
+            "parameters": self.parameters,
+            "inputs": self.inputs,
+        }
+
+
+class Output(NamedTuple):
+    """One file of an artefact: path inside it (POSIX), size in bytes, sha256."""
+
+    path: str
+    size: int
+    sha256: str
+
+
+class Manifest(NamedTuple):
+    """A key record and the outputs it led to."""
+
+    record: KeyRecord
+    outputs: tuple[Output, ...]
+
+    @property
+    def content(self) -> str:
+        """sha256 of the outputs alone: what a stage that reads the whole artefact depends on."""
+        return content_digest(self.outputs)
+
+    @property
+    def id(self) -> str:
+        """sha256 of key record and outputs (design: Store, 2)."""
+        return digest({"record": self.record.as_json(), "outputs": _as_json(self.outputs)})
+
+    def encode(self) -> bytes:
+        """The bytes of ``manifest.json``."""
+        value = {**self.record.as_json(), "outputs": _as_json(self.outputs)}
+        return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode() + b"\n"
+
+
+def _as_json(outputs: Iterable[Output]) -> list[dict[str, Any]]:
+    return [
+        {"path": o.path, "size": o.size, "sha256": o.sha256}
+        for o in sorted(outputs, key=lambda o: o.path)
+    ]
+
+
+def content_digest(outputs: Iterable[Output]) -> str:
+    """sha256 of a set of files, whatever made them and wherever they lie."""
+    return digest(_as_json(outputs))
+
+
+def directory_outputs(directory: Path) -> tuple[Output, ...]:
+    """The files below ``directory`` as outputs, an artefact's own two left out.
+
+    Raises:
+        OSError: a file cannot be read.
+        ValueError: something that is no plain file.
+    """
+    found = []
+    for path in sorted(p for p in directory.rglob("*") if p.is_symlink() or not p.is_dir()):
+        if not stat.S_ISREG(path.lstat().st_mode):
+            raise ValueError(f"{path} is not a plain file")
+        name = path.relative_to(directory).as_posix()
+        if name not in (MANIFEST, PROVENANCE):
+            output = Output(check_output_path(name), path.stat().st_size, file_digest(path))
+            found.append(output)
+    return tuple(found)
+
+
+def read_json(path: Path) -> Any:
+    """A JSON document of at most 16 MiB from a regular file.
+
+    Raises:
+        IntegrityError: absent, not a regular file, too large, not JSON, or nested too deeply.
+    """
+    try:
+        if path.is_symlink() or not path.is_file():
+            raise IntegrityError(f"{path} is missing or not a regular file")
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise IntegrityError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB")
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise IntegrityError(f"{path} is not valid JSON ({error})") from None
+    except OSError as error:
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """The manifest of the artefact in ``directory``, every field checked.
+
+    Raises:
+        IntegrityError: unreadable, malformed, or of a newer schema.
+    """
+    path = directory / MANIFEST
+    value = read_json(path)
+    if (
+        isinstance(value, dict)
+        and isinstance(value.get("schema"), int)
+        and value["schema"] > SCHEMA
+    ):
+        raise IntegrityError(
+            f"{path} has schema {value['schema']}, newer than the {SCHEMA} known here",
+            "it was written by a newer irlcli: upgrade this one",
+        )
+    try:
+        return _parse_manifest(value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise IntegrityError(f"{path} is malformed ({error})") from None
+
+
+def _parse_manifest(value: Any) -> Manifest:
+    expected = {"schema", "stage", "stage_version", "parameters", "inputs", "outputs"}
+    if not isinstance(value, dict) or set(value) != expected:
+        raise ValueError(f"its keys are not {', '.join(sorted(expected))}")
+    if value["schema"] != SCHEMA:
+        raise ValueError(f"schema {value['schema']!r} is unknown")
+    if not isinstance(value["stage"], str) or type(value["stage_version"]) is not int:
+        raise ValueError("stage or stage_version has the wrong type")
+    if not isinstance(value["parameters"], dict) or not isinstance(value["inputs"], dict):
+        raise ValueError("parameters or inputs is no object")
+    for role, sha in value["inputs"].items():
+        if not isinstance(sha, str) or not re.fullmatch(_SHA, sha):
+            raise ValueError(f"input {role!r} is no sha256")
+    outputs = []
+    for item in value["outputs"]:
+        if set(item) != {"path", "size", "sha256"}:
+            raise ValueError("an output has other keys than path, size, sha256")
+        if type(item["size"]) is not int or item["size"] < 0:
+            raise ValueError(f"output {item['path']!r} has no size")
+        if not isinstance(item["sha256"], str) or not re.fullmatch(_SHA, item["sha256"]):
+            raise ValueError(f"output {item['path']!r} has no sha256")
+        outputs.append(Output(check_output_path(item["path"]), item["size"], item["sha256"]))
+    if len({o.path for o in outputs}) != len(outputs):
+        raise ValueError("an output path appears twice")
+    record = KeyRecord(value["stage"], value["stage_version"], value["parameters"], value["inputs"])
+    canonical_json(record.as_json())
+    return Manifest(record, tuple(outputs))
+
+
+def check_output_path(path: Any) -> str:
+    """``path`` if it stays inside an artefact and names none of its own two files.
+
+    Raises:
+        ValueError: empty, absolute, with ``..``, a backslash or a NUL, or reserved.
+    """
+    if not isinstance(path, str) or not path or "\\" in path or "\0" in path:
+        raise ValueError(f"output path {path!r} is not allowed")
+    parts = PurePosixPath(path).parts
+    if path.startswith("/") or ".." in parts or "/".join(parts) != path:
+        raise ValueError(f"output path {path!r} is not allowed")
+    if path in (MANIFEST, PROVENANCE):
+        raise ValueError(f"output path {path!r} is reserved")
+    return path
+
+
+def encode_provenance(artefact_id: str, record: dict[str, Any]) -> bytes:
+    """The bytes of ``provenance.json``: the record, its artefact's id and a checksum of both."""
+    body = {"schema": SCHEMA, "artefact": artefact_id, "record": record}
+    value = {**body, "sha256": digest(body)}
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode() + b"\n"
+
+
+def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
+    """The provenance record of the artefact ``artefact_id`` in ``directory``.
+
+    Raises:
+        IntegrityError: unreadable, altered, or written for another artefact.
+    """
+    path = directory / PROVENANCE
+    value = read_json(path)
+    if not isinstance(value, dict) or not isinstance(value.get("record"), dict):
+        raise IntegrityError(f"{path} is malformed")
+    body = {name: item for name, item in value.items() if name != "sha256"}
+    if value.get("sha256") != digest(body):
+        raise IntegrityError(f"{path} was altered: its checksum does not match")
+    if value.get("artefact") != artefact_id:
+        raise IntegrityError(f"{path} belongs to another artefact")
+    return value["record"]

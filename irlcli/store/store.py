@@ -1,0 +1,595 @@
+"""The content-addressed artefact store.
+
+::
+
+    runs/STORE                     format version
+    runs/<id16>/                   manifest.json provenance.json reward.pt ...
+    runs/.keys/<key>               the id16 that key led to
+    runs/.names/<name>             an id16
+    runs/.work/<key>/              scratch of a stage at work
+    runs/.locks/  .quarantine/
+
+An artefact is whole or absent at any moment: it is written under ``.work``, made durable, and
+appears by one rename. The first result of a key wins; a second, different one is kept beside it.
+Reading checks before it trusts: what does not match is moved to quarantine, never deleted.
+"""
+
+import errno
+import os
+import re
+import shutil
+import stat
+import time
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from irlcli.errors import IntegrityError, NotFound, UsageError, suggest
+from irlcli.store.digest import file_digest
+from irlcli.store.lock import is_locked, locked
+from irlcli.store.manifest import (
+    MANIFEST,
+    PROVENANCE,
+    KeyRecord,
+    Manifest,
+    Output,
+    directory_outputs,
+    encode_provenance,
+    read_json,
+    read_manifest,
+    read_provenance,
+)
+from irlcli.store.scratch import Scratch, fsync_directory, write_durably
+
+FORMAT = 1
+_ID_DIGITS = 16
+_ID = rf"[0-9a-f]{{{_ID_DIGITS}}}"
+_KEY = r"[0-9a-f]{64}"
+_PREFIX = r"[0-9a-f]{3,64}"
+_NAME = r"[A-Za-z][A-Za-z0-9._-]{0,99}"
+
+
+class Artefact(NamedTuple):
+    """A published artefact: its directory and its manifest."""
+
+    directory: Path
+    manifest: Manifest
+
+    @property
+    def id(self) -> str:
+        """The first 16 hexadecimal digits of the id, its directory's name."""
+        return self.directory.name
+
+    def output(self, path: str) -> Output:
+        """The output called ``path``.
+
+        Raises:
+            NotFound: the artefact has no such output.
+        """
+        for output in self.manifest.outputs:
+            if output.path == path:
+                return output
+        names = [o.path for o in self.manifest.outputs]
+        raise NotFound(f"artefact {self.id} holds no {path!r}", suggest(path, names))
+
+    def provenance(self) -> dict[str, Any]:
+        """Where it came from: command line, versions, timings.
+
+        Raises:
+            IntegrityError: altered or unreadable.
+        """
+        return read_provenance(self.directory, self.manifest.id)
+
+
+class Published(NamedTuple):
+    """What publishing led to; ``diverged`` is the artefact that holds the key if not this one."""
+
+    artefact: Artefact
+    diverged: Artefact | None = None
+
+
+class Damage(NamedTuple):
+    """What is wrong with an artefact, and the command that made it if it still says so."""
+
+    problems: list[str]
+    command: str
+
+
+class Resolved(NamedTuple):
+    """What a reference names: an artefact and perhaps one of its outputs, or a foreign path."""
+
+    artefact: Artefact | None
+    path: Path
+
+    @property
+    def output(self) -> str | None:
+        """Path of the output inside the artefact; None if the reference names all of it."""
+        if self.artefact is None or self.path == self.artefact.directory:
+            return None
+        return self.path.relative_to(self.artefact.directory).as_posix()
+
+
+class Store:
+    """A store in the directory ``root``, created on first use.
+
+    Raises:
+        IntegrityError: ``root`` holds something else, or a store of a newer format.
+        UsageError: ``root`` is not a directory.
+    """
+
+    def __init__(self, root: Path | str):
+        self.root = Path(root)
+        if self.root.exists() and not self.root.is_dir():
+            raise UsageError(f"{self.root} is not a directory", "name a directory with --store")
+        marker = self.root / "STORE"
+        if marker.exists():
+            value = read_json(marker)
+            version = value.get("format") if isinstance(value, dict) else None
+            if not isinstance(version, int) or version < 1:
+                raise IntegrityError(f"{marker} names no format", "is this an irlcli store?")
+            if version > FORMAT:
+                raise IntegrityError(
+                    f"{self.root} is a store of format {version}, newer than the {FORMAT} known here",
+                    "it was made by a newer irlcli: upgrade this one, or name another --store",
+                )
+        elif self.root.exists() and any(not p.name.startswith(".") for p in self.root.iterdir()):
+            # Hidden directories alone may be a store whose creation was cut short.
+            raise IntegrityError(
+                f"{self.root} has files in it but is no store",
+                "name an empty or a new directory with --store",
+            )
+
+    # Layout
+
+    def _keys(self) -> Path:
+        return self.root / ".keys"
+
+    def _names(self) -> Path:
+        return self.root / ".names"
+
+    def _work(self) -> Path:
+        return self.root / ".work"
+
+    def _locks(self) -> Path:
+        return self.root / ".locks"
+
+    def _quarantine(self) -> Path:
+        return self.root / ".quarantine"
+
+    def create(self) -> None:
+        """Make the directories and the format marker, if they are not there.
+
+        Raises:
+            OSError: the place cannot be written.
+        """
+        if (self.root / "STORE").exists():
+            return
+        for directory in (self._keys(), self._names(), self._work(), self._locks()):
+            directory.mkdir(parents=True, exist_ok=True)
+        self._quarantine().mkdir(exist_ok=True)
+        write_durably(self.root / "STORE", b'{"format": %d}\n' % FORMAT)
+
+    # Reading
+
+    def find(self, key: str) -> Artefact | None:
+        """The artefact that ``key`` led to, or None. Checks the manifest, not the outputs.
+
+        Raises:
+            IntegrityError: the artefact is damaged; it has been moved to quarantine.
+        """
+        pointer = self._keys() / key
+        try:
+            name = pointer.read_text("ascii").strip()
+        except FileNotFoundError:
+            return None
+        except (UnicodeDecodeError, OSError):
+            name = ""
+        if not re.fullmatch(_ID, name) or not (self.root / name).is_dir():
+            # The artefact was removed, or the pointer damaged: computing again repairs both.
+            return None
+        artefact = self.get(name)
+        if artefact.manifest.record.key != key:
+            return None
+        for output in artefact.manifest.outputs:
+            path = artefact.directory / output.path
+            if not path.is_file() or path.stat().st_size != output.size:
+                raise self._damaged(artefact.directory, f"{output.path} is missing or truncated")
+        return artefact
+
+    def get(self, id16: str) -> Artefact:
+        """The artefact in directory ``id16``, its manifest checked against that address.
+
+        Raises:
+            IntegrityError: the manifest is damaged; the artefact has been moved to quarantine.
+        """
+        directory = self.root / id16
+        try:
+            manifest = read_manifest(directory)
+        except IntegrityError as error:
+            if "newer" in error.message:
+                raise
+            raise self._damaged(directory, error.message) from None
+        if manifest.id[:_ID_DIGITS] != id16:
+            raise self._damaged(directory, "its manifest does not match its address")
+        return Artefact(directory, manifest)
+
+    def open(self, artefact: Artefact, path: str) -> Path:
+        """The file of an output, its bytes checked against the manifest.
+
+        Raises:
+            NotFound: no such output.
+            IntegrityError: other bytes; the artefact has been moved to quarantine.
+        """
+        output = artefact.output(path)
+        problem = _output_problem(artefact.directory, output)
+        if problem:
+            raise self._damaged(artefact.directory, problem)
+        return artefact.directory / path
+
+    def ids(self) -> list[str]:
+        """The ids of all artefacts, sorted."""
+        try:
+            return sorted(
+                entry.name for entry in os.scandir(self.root) if re.fullmatch(_ID, entry.name)
+            )
+        except FileNotFoundError:
+            return []
+
+    def artefacts(self) -> Iterator[Artefact]:
+        """All artefacts with a sound manifest; damaged ones raise as :meth:`get` does."""
+        for name in self.ids():
+            yield self.get(name)
+
+    def names(self) -> dict[str, str]:
+        """Name to id, sorted by name."""
+        try:
+            entries = sorted(p for p in self._names().iterdir() if re.fullmatch(_NAME, p.name))
+        except FileNotFoundError:
+            return {}
+        found = {entry.name: entry.read_text("utf-8", "replace").strip() for entry in entries}
+        return {name: id16 for name, id16 in found.items() if re.fullmatch(_ID, id16)}
+
+    # References
+
+    def resolve(self, ref: str) -> Resolved:
+        """What ``ref`` names: a path into an artefact, a name, a unique id prefix of at least 3
+        digits (alone or inside a path), or an existing file or directory outside the store.
+
+        Raises:
+            NotFound: nothing, or more than one thing, is called that.
+            IntegrityError: the artefact is damaged.
+        """
+        root, absolute = os.path.abspath(self.root), os.path.abspath(ref)
+        inside = absolute.startswith(root + os.sep)
+        text = os.path.relpath(absolute, root) if inside else ref.rstrip("/")
+        head, _, rest = text.partition("/")
+        artefact = None
+        if not os.path.isabs(text) and head not in ("", ".", ".."):
+            artefact = self._by_name(head) or self._by_prefix(head)
+        if artefact is None:
+            if not inside and os.path.exists(ref):
+                return Resolved(None, Path(ref))
+            known = [*self.names(), *self.ids()]
+            hint = "`irl ls` lists the artefacts"
+            close = suggest(head, known) if known else ""
+            if close.startswith("did you mean"):
+                hint = close.split(";")[0] + "; " + hint
+            raise NotFound(f"{ref!r} names no artefact and no file", hint)
+        if not rest:
+            return Resolved(artefact, artefact.directory)
+        artefact.output(rest)
+        return Resolved(artefact, artefact.directory / rest)
+
+    def _by_name(self, name: str) -> Artefact | None:
+        if not re.fullmatch(_NAME, name):
+            return None
+        id16 = self.names().get(name)
+        if id16 is None:
+            return None
+        if not (self.root / id16).is_dir():
+            raise NotFound(
+                f"the name {name!r} points to {id16}, which is gone", "name another with `irl name`"
+            )
+        return self.get(id16)
+
+    def _by_prefix(self, prefix: str) -> Artefact | None:
+        if not re.fullmatch(_PREFIX, prefix):
+            return None
+        short = prefix[:_ID_DIGITS]
+        matches = [name for name in self.ids() if name.startswith(short)]
+        if len(matches) > 1:
+            shown = ", ".join(matches[:5]) + (", ..." if len(matches) > 5 else "")
+            raise NotFound(
+                f"{prefix!r} is ambiguous: {shown}", "write more digits of the one you mean"
+            )
+        if not matches:
+            return None
+        artefact = self.get(matches[0])
+        return artefact if artefact.manifest.id.startswith(prefix) else None
+
+    def set_name(self, name: str, artefact: Artefact) -> None:
+        """Let ``name`` stand for ``artefact``; rewritten only if that changes something.
+
+        Raises:
+            UsageError: not a name (letters, digits, ``._-``; an id prefix is none).
+        """
+        if not re.fullmatch(_NAME, name) or re.fullmatch(_PREFIX, name):
+            raise UsageError(
+                f"{name!r} cannot be a name",
+                "a letter, then letters, digits, '.', '_', '-'; not hexadecimal digits alone, "
+                "which would read as an id",
+            )
+        if self.names().get(name) != artefact.id:
+            write_durably(self._names() / name, artefact.id.encode() + b"\n")
+
+    # Writing
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Keep ``gc`` away while artefacts are read or made.
+
+        Raises:
+            Busy: gc is running.
+        """
+        with locked(self._locks() / "gc", shared=True):
+            yield
+
+    @contextmanager
+    def working_on(self, key: str, wait: bool, on_wait=None) -> Iterator[Scratch]:
+        """Hold the lock of ``key`` and its scratch directory.
+
+        Raises:
+            Busy: another process holds it and ``wait`` is false.
+        """
+        with locked(self._locks() / key, wait=wait, on_wait=on_wait):
+            yield Scratch(self._work() / key)
+
+    def has_checkpoint(self, key: str) -> bool:
+        """Whether an interrupted run of ``key`` left something to go on from."""
+        return (self._work() / key / "checkpoint").exists()
+
+    def publish(self, record: KeyRecord, output: Path, provenance: dict[str, Any]) -> Published:
+        """Turn the directory ``output`` (under ``.work``) into the artefact of ``record``.
+
+        The files are made durable and read-only, the manifest is written last, the directory
+        appears under its id by one rename, and the key is claimed by an atomic link (design:
+        Store, 5). ``output`` is gone afterwards.
+
+        Raises:
+            OSError: disk full or not writable; nothing was published.
+            ValueError: the outputs hold something that is no plain file.
+        """
+        manifest = Manifest(record, directory_outputs(output))
+        for item in manifest.outputs:
+            _fsync_file(output / item.path)
+            (output / item.path).chmod(0o444)
+        write_durably(output / PROVENANCE, encode_provenance(manifest.id, provenance))
+        (output / PROVENANCE).chmod(0o444)
+        write_durably(output / MANIFEST, manifest.encode())
+        (output / MANIFEST).chmod(0o444)
+        for directory in {path.parent for path in _entries(output)}:
+            fsync_directory(directory)
+        artefact = self._place(output, manifest)
+        holder = self._claim(record.key, artefact)
+        shutil.rmtree(self._work() / record.key, ignore_errors=True)
+        return Published(artefact, None if holder.id == artefact.id else holder)
+
+    def _place(self, output: Path, manifest: Manifest) -> Artefact:
+        target = self.root / manifest.id[:_ID_DIGITS]
+        try:
+            output.rename(target)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            # Equal bytes were published before, perhaps by a process that died before its claim.
+            if not self.problems(target.name):
+                shutil.rmtree(output)
+                return Artefact(target, manifest)
+            self._move_to_quarantine(target)
+            output.rename(target)
+        target.chmod(0o555)
+        fsync_directory(self.root)
+        return Artefact(target, manifest)
+
+    def _claim(self, key: str, artefact: Artefact) -> Artefact:
+        pointer = self._keys() / key
+        temporary = self._keys() / f".{key}.{uuid.uuid4().hex}"
+        write_durably(temporary, artefact.id.encode() + b"\n")
+        try:
+            while True:
+                try:
+                    os.link(temporary, pointer)
+                    fsync_directory(self._keys())
+                    return artefact
+                except FileExistsError:
+                    holder = self.find(key)
+                    if holder is not None:
+                        return holder
+                    pointer.unlink(missing_ok=True)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    # Integrity
+
+    def problems(self, id16: str, quick: bool = False) -> list[str]:
+        """What is wrong with the artefact ``id16``; empty if nothing. Moves nothing.
+
+        ``quick`` compares sizes instead of hashing the outputs.
+        """
+        directory = self.root / id16
+        try:
+            manifest = read_manifest(directory)
+        except IntegrityError as error:
+            return [error.message]
+        if manifest.id[:_ID_DIGITS] != id16:
+            return [f"{directory / MANIFEST} does not match its address"]
+        found = [
+            problem
+            for output in manifest.outputs
+            if (problem := _output_problem(directory, output, quick))
+        ]
+        try:
+            read_provenance(directory, manifest.id)
+        except IntegrityError as error:
+            found.append(error.message)
+        known = {o.path for o in manifest.outputs} | {MANIFEST, PROVENANCE}
+        found += [
+            f"{path} is not in the manifest"
+            for path in _entries(directory)
+            if path.relative_to(directory).as_posix() not in known
+        ]
+        return found
+
+    def verify(self, ids: Iterable[str], quick: bool = False) -> dict[str, Damage]:
+        """Check artefacts; the damaged ones are moved to quarantine. Returns these."""
+        damaged = {}
+        for id16 in ids:
+            problems = self.problems(id16, quick)
+            if problems:
+                damaged[id16] = Damage(problems, _recorded_command(self.root / id16))
+                if not any("newer" in p for p in problems):
+                    self._move_to_quarantine(self.root / id16)
+        return damaged
+
+    def _damaged(self, directory: Path, problem: str) -> IntegrityError:
+        command = _recorded_command(directory)
+        hint = f"compute it again: {command}" if command else "compute it again"
+        try:
+            place = self._move_to_quarantine(directory)
+        except OSError as error:
+            return IntegrityError(
+                f"artefact {directory.name} is damaged: {problem}; it could not be moved to "
+                f"quarantine ({error.strerror})",
+                hint,
+            )
+        return IntegrityError(
+            f"artefact {directory.name} was damaged and is now in {place}: {problem}", hint
+        )
+
+    def _move_to_quarantine(self, directory: Path) -> Path:
+        for pointer in _pointers_to(self._keys(), directory.name):
+            pointer.unlink(missing_ok=True)
+        place = self._quarantine() / f"{directory.name}-{uuid.uuid4().hex[:8]}"
+        # Moving a directory to another parent rewrites its "..", which needs write permission.
+        if not directory.is_symlink():
+            directory.chmod(0o755)
+        directory.rename(place)
+        return place
+
+    # Ancestry and collection
+
+    def ancestors(self, artefact: Artefact) -> dict[str, list[Artefact]]:
+        """For each input role of ``artefact``, the artefacts that hold that content."""
+        sources = self._sources()
+        return {
+            role: [self.get(name) for name in sources.get(sha, [])]
+            for role, sha in artefact.manifest.record.inputs.items()
+        }
+
+    def _sources(self) -> dict[str, list[str]]:
+        sources: dict[str, list[str]] = {}
+        for artefact in self.artefacts():
+            contents = {o.sha256 for o in artefact.manifest.outputs} | {artefact.manifest.content}
+            for sha in contents:
+                sources.setdefault(sha, []).append(artefact.id)
+        return sources
+
+    def garbage(self, grace_seconds: float) -> list[Artefact]:
+        """Artefacts that no name leads to and that are older than the grace period."""
+        sources = self._sources()
+        everything = {artefact.id: artefact for artefact in self.artefacts()}
+        reached: set[str] = set()
+        pending = [id16 for id16 in self.names().values() if id16 in everything]
+        while pending:
+            id16 = pending.pop()
+            if id16 not in reached:
+                reached.add(id16)
+                for sha in everything[id16].manifest.record.inputs.values():
+                    pending += sources.get(sha, [])
+        limit = time.time() - grace_seconds
+        return [
+            artefact
+            for id16, artefact in everything.items()
+            if id16 not in reached and artefact.directory.stat().st_mtime < limit
+        ]
+
+    def stale_work(self, grace_seconds: float) -> list[Path]:
+        """Scratch directories that nobody holds and nobody touched within the grace period."""
+        limit = time.time() - grace_seconds
+        try:
+            entries = sorted(self._work().iterdir())
+        except FileNotFoundError:
+            return []
+        return [
+            path
+            for path in entries
+            if path.stat().st_mtime < limit and not is_locked(self._locks() / path.name)
+        ]
+
+    def collect(self, grace_seconds: float) -> tuple[list[Artefact], list[Path]]:
+        """Remove ``garbage`` and ``stale_work``; returns what was removed.
+
+        Raises:
+            Busy: the store is in use.
+        """
+        with locked(self._locks() / "gc"):
+            artefacts, work = self.garbage(grace_seconds), self.stale_work(grace_seconds)
+            for artefact in artefacts:
+                for pointer in _pointers_to(self._keys(), artefact.id):
+                    pointer.unlink(missing_ok=True)
+                grave = self._work() / f"removed-{artefact.id}"
+                artefact.directory.chmod(0o755)
+                artefact.directory.rename(grave)
+                shutil.rmtree(grave)
+            for path in work:
+                shutil.rmtree(path)
+                (self._locks() / path.name).unlink(missing_ok=True)
+            return artefacts, work
+
+
+def _recorded_command(directory: Path) -> str:
+    """The command line in a provenance that need not be sound; empty if it cannot be told."""
+    import shlex
+
+    try:
+        return shlex.join(read_json(directory / PROVENANCE)["record"]["command"])
+    except (IntegrityError, KeyError, TypeError):
+        return ""
+
+
+def _pointers_to(keys: Path, id16: str) -> list[Path]:
+    """The keys that lead to ``id16``, found without trusting its manifest."""
+    return [
+        path
+        for path in keys.iterdir()
+        if re.fullmatch(_KEY, path.name) and path.read_bytes().strip() == id16.encode()
+    ]
+
+
+def _entries(directory: Path) -> list[Path]:
+    """Everything below ``directory`` but plain directories."""
+    return [p for p in directory.rglob("*") if p.is_symlink() or not p.is_dir()]
+
+
+def _fsync_file(path: Path) -> None:
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
+
+
+def _output_problem(directory: Path, output: Output, quick: bool = False) -> str | None:
+    path = directory / output.path
+    try:
+        information = path.lstat()
+    except OSError as error:
+        return f"{path} cannot be read ({error.strerror})"
+    if not stat.S_ISREG(information.st_mode):
+        return f"{path} is not a plain file"
+    if any((directory / part).is_symlink() for part in Path(output.path).parents):
+        return f"{path} is reached through a symbolic link"
+    if information.st_size != output.size:
+        return f"{path} has {information.st_size} bytes instead of {output.size}"
+    if not quick and file_digest(path) != output.sha256:
+        return f"{path} has other bytes than were published"
+    return None

@@ -1,0 +1,340 @@
+"""Finite Markov decision processes as exact arrays, and dynamic programming over many of them.
+
+Transitions are factored through *afterstates* (Sutton and Barto 2018, Sec. 6.8): an action leads
+from s to an afterstate without chance, chance leads from there to s',
+
+    P(s' | s, a) = sum_k probability[afterstate[a, s], k] * [successor[afterstate[a, s], k] = s'].
+
+In a gridworld the afterstate is the intended cell, so the sparse part is shared by the actions;
+any finite MDP has this form with one afterstate per (s, a). Time and memory are linear in states.
+
+Everything is batched over E settings (MDPs of one shape, side by side as one sparse MDP) and over
+R rewards. Arrays that the solver passes on keep R last, so that a sparse row acts on all R at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+DENSE_LIMIT = 1024  # states; four actions then take 32 MiB
+MEMORY_LIMIT = 8 * 2**30  # bytes
+TIE_TOLERANCE = 1e-9  # relative: actions whose values differ by less are equally good
+
+
+@dataclass(frozen=True, eq=False)
+class TabularMDP:
+    """One finite MDP with S states, A actions, X afterstates of at most K successors.
+
+    Attributes:
+        afterstate: [A, S] int64, where action a leads from state s before chance acts.
+        successor: [X, K] int64, the intended one first.
+        probability: [X, K] float64; a row sums to one, or is all zero: the episode has ended.
+        start: [S] float64, distribution of the first state.
+        reward: [S] float64, the true reward of acting in a state.
+        goal: the goal's state index.
+
+    Raises:
+        ValueError: shapes that do not fit, indices out of range, or rows that are no distribution.
+    """
+
+    afterstate: np.ndarray
+    successor: np.ndarray
+    probability: np.ndarray
+    start: np.ndarray
+    reward: np.ndarray
+    goal: int
+
+    def __post_init__(self) -> None:
+        if self.afterstate.ndim != 2 or self.start.shape != (self.n_states,):
+            raise ValueError("afterstate must be [A, S] and start [S]")
+        if self.reward.shape != (self.n_states,) or not np.isfinite(self.reward).all():
+            raise ValueError(f"reward must be {self.n_states} finite numbers")
+        if self.successor.shape != self.probability.shape or self.successor.ndim != 2:
+            raise ValueError("successor and probability must both be [X, K]")
+        for name, index, limit in (
+            ("afterstate", self.afterstate, len(self.successor)),
+            ("successor", self.successor, self.n_states),
+            ("goal", np.array([self.goal]), self.n_states),
+        ):
+            if index.size == 0 or index.min() < 0 or index.max() >= limit:
+                raise ValueError(f"{name} must hold indices below {limit}")
+        total = self.probability.sum(1)
+        ended = (self.probability == 0.0).all(1)
+        if not (self.probability >= 0.0).all() or not np.allclose(total[~ended], 1.0, atol=1e-12):
+            raise ValueError("a row of probability must sum to one, or be all zero")
+        if not (self.start >= 0.0).all() or not np.isclose(self.start.sum(), 1.0):
+            raise ValueError("start must be a distribution")
+
+    @property
+    def n_states(self) -> int:
+        """S."""
+        return self.afterstate.shape[1]
+
+    @property
+    def n_actions(self) -> int:
+        """A."""
+        return self.afterstate.shape[0]
+
+    @property
+    def terminal(self) -> np.ndarray:
+        """[S] bool: the states in which the episode has ended, so that nothing is chosen."""
+        return (self.probability == 0.0).all(1)[self.afterstate].all(0)
+
+
+def dense_transitions(mdp: TabularMDP) -> np.ndarray:
+    """P(s'|s, a) as [A, S, S] float64, for tiny cases and for checking.
+
+    Raises:
+        ValueError: more than ``DENSE_LIMIT`` states.
+    """
+    if mdp.n_states > DENSE_LIMIT:
+        raise ValueError(
+            f"{mdp.n_states} states are too many for dense transitions (at most {DENSE_LIMIT})"
+        )
+    spread = np.zeros((len(mdp.successor), mdp.n_states))
+    rows = np.broadcast_to(np.arange(len(spread))[:, None], mdp.successor.shape)
+    np.add.at(spread, (rows, mdp.successor), mdp.probability)
+    return spread[mdp.afterstate]
+
+
+def shortest_path_length(mdp: TabularMDP) -> int:
+    """The fewest steps from any possible first state to the goal if every move goes as intended.
+
+    Raises:
+        ValueError: the goal cannot be reached.
+    """
+    possible = mdp.probability[:, 0] > 0.0
+    reached = mdp.start > 0.0
+    steps = 0
+    while not reached[mdp.goal]:
+        after = mdp.afterstate[:, reached].ravel()
+        grown = reached.copy()
+        grown[mdp.successor[after[possible[after]], 0]] = True
+        if (grown == reached).all():
+            raise ValueError("the goal cannot be reached from the start")
+        reached = grown
+        steps += 1
+    return steps
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """E MDPs of one shape, as one block-diagonal sparse MDP over E * S states.
+
+    Made by :func:`stack`. ``spread`` [E*X, E*S] takes values of states to values of afterstates;
+    ``collect`` [E*X, A*E*S] adds up what the actions send to each afterstate; ``arrivals``
+    [E*X, E*S] counts the actions that lead from a state to an afterstate.
+    """
+
+    mdps: tuple[TabularMDP, ...]
+    afterstate: np.ndarray  # [A, E*S] int64
+    spread: sparse.csr_array
+    spread_transposed: sparse.csr_array
+    collect: sparse.csr_array
+    arrivals: sparse.csr_array
+    terminal: np.ndarray  # [E*S] bool
+    start: np.ndarray  # [E, S]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(E, S, A)."""
+        return len(self.mdps), self.mdps[0].n_states, self.mdps[0].n_actions
+
+
+def stack(mdps: Sequence[TabularMDP]) -> Settings:
+    """Put ``mdps`` side by side.
+
+    Raises:
+        ValueError: none given, or their shapes differ.
+    """
+    if not mdps:
+        raise ValueError("at least one MDP is needed")
+    shapes = {(m.afterstate.shape, m.successor.shape) for m in mdps}
+    if len(shapes) > 1:
+        raise ValueError(f"MDPs of different shapes cannot be solved together: {sorted(shapes)}")
+    (a, n), (x, k) = mdps[0].afterstate.shape, mdps[0].successor.shape
+    afterstate = np.concatenate([m.afterstate + e * x for e, m in enumerate(mdps)], axis=1)
+    successor = np.concatenate([m.successor + e * n for e, m in enumerate(mdps)])
+    probability = np.concatenate([m.probability for m in mdps])
+    rows = np.repeat(np.arange(len(mdps) * x), k)
+    spread = sparse.csr_array(
+        (probability.ravel(), (rows, successor.ravel())), shape=(len(mdps) * x, len(mdps) * n)
+    )
+    spread.eliminate_zeros()
+    collect = sparse.csr_array(
+        (np.ones(afterstate.size), (afterstate.ravel(), np.arange(afterstate.size))),
+        shape=(len(mdps) * x, afterstate.size),
+    )
+    return Settings(
+        mdps=tuple(mdps),
+        afterstate=afterstate,
+        spread=spread,
+        spread_transposed=spread.T.tocsr(),
+        collect=collect,
+        arrivals=collect @ sparse.vstack([sparse.eye_array(len(mdps) * n, format="csr")] * a),
+        terminal=np.concatenate([m.terminal for m in mdps]),
+        start=np.stack([m.start for m in mdps]),
+    )
+
+
+Backup = Callable[[np.ndarray], np.ndarray]
+"""Turns action values [A, E*S, ...] into the policy, in place; returns state values [E*S, ...]."""
+
+
+def hard_backup(action_values: np.ndarray) -> np.ndarray:
+    """max_a Q; the policy is greedy, uniform over ties. A :data:`Backup`."""
+    best = action_values.max(0)
+    slack = TIE_TOLERANCE * np.maximum(1.0, np.abs(best))
+    np.greater_equal(action_values, best - slack, out=action_values)
+    action_values /= action_values.sum(0)
+    return best
+
+
+def backward(
+    settings: Settings, reward: np.ndarray, horizon: int, backup: Backup, discount: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Finite-horizon dynamic programming: V_H = r, Q_t = gamma E[V_{t+1}], V_t = r + backup(Q_t).
+
+    A trajectory is s_0, a_0, ..., s_H: H actions, and a reward for each of its H + 1 states.
+
+    Args:
+        reward: [R, S], the same reward in every setting, or [R, E, S].
+        horizon: H, at least 1 [steps].
+
+    Returns:
+        The policy pi_t(a|s) [H, A, E, S, R] and V_0 [E, S, R].
+
+    Raises:
+        ValueError: a reward of another shape or not finite; or as :func:`check_size`.
+    """
+    e, n, a = settings.shape
+    flat = columns(settings, reward)
+    check_size(horizon, discount, a * flat.size)
+    policy = np.empty((horizon, a, *flat.shape))
+    value = flat
+    for t in reversed(range(horizon)):
+        after = settings.spread @ value
+        if discount != 1.0:
+            after *= discount
+        # The indices are known to be in range; "clip" lets take write without a buffer.
+        after.take(settings.afterstate, axis=0, out=policy[t], mode="clip")
+        value = backup(policy[t])
+        value += flat
+    return policy.reshape(horizon, a, e, n, -1), value.reshape(e, n, -1)
+
+
+def forward(
+    settings: Settings, policy: np.ndarray, discount: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """State distributions under ``policy`` [H, A, E, S, R], as :func:`backward` returns it.
+
+    Returns:
+        The occupancy sum_{t=0..H} gamma^t P(s_t = s) [R, E, S], and P(s_H = s) [R, E, S]. An
+        episode that has ended is in no state, so that a distribution may sum to less than one.
+    """
+    horizon, a, e, n, runs = policy.shape
+    state = columns(settings, np.broadcast_to(settings.start, (runs, e, n)))
+    steps = policy.reshape(horizon, a, *state.shape)
+    occupancy = state.copy()
+    flow = np.empty((a, *state.shape))
+    outflow = flow.reshape(a * e * n, *state.shape[1:])
+    for t in range(horizon):
+        np.multiply(steps[t], state, out=flow)
+        state = settings.spread_transposed @ (settings.collect @ outflow)
+        occupancy += state if discount == 1.0 else discount ** (t + 1) * state
+    return runs_first(settings, occupancy), runs_first(settings, state)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """How a policy fares at the true task, [R, E]."""
+
+    goal_probability: np.ndarray  # of having reached the goal within the horizon
+    true_return: np.ndarray  # undiscounted, as the environment pays it: for s_0 .. s_{H-1}
+
+
+def evaluate(settings: Settings, policy: np.ndarray) -> Evaluation:
+    """Exact evaluation of ``policy`` [H, A, E, S, R] by the true reward of each setting.
+
+    The goal must keep whoever reaches it, or end the episode.
+    """
+    occupancy, last = forward(settings, policy)
+    goals = np.array([m.goal for m in settings.mdps])
+    e = np.arange(len(goals))
+    reached = 1.0 - last.sum(-1) + last[:, e, goals]
+    reward = np.stack([m.reward for m in settings.mdps])
+    paid = ((occupancy - last) * reward).sum(-1)
+    return Evaluation(np.clip(reached, 0.0, 1.0), paid)
+
+
+def optimal_policy(
+    settings: Settings, reward: np.ndarray, horizon: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Value iteration over ``horizon`` steps: policy [H, A, E, S, R], uniform over ties, and V_0.
+
+    Raises:
+        ValueError: as :func:`backward`; or the goal of a setting cannot be reached, at all or
+            within the horizon.
+    """
+    for e, mdp in enumerate(settings.mdps):
+        try:
+            needed = shortest_path_length(mdp)
+        except ValueError as error:
+            raise ValueError(f"setting {e}: {error}") from None
+        if needed > horizon:
+            raise ValueError(
+                f"setting {e}: the goal is {needed} steps away, the horizon only {horizon}"
+            )
+    return backward(settings, reward, horizon, hard_backup)
+
+
+def true_reward(settings: Settings) -> np.ndarray:
+    """[1, E, S]: the true rewards, as :func:`backward` takes them."""
+    return np.stack([m.reward for m in settings.mdps])[None]
+
+
+def columns(settings: Settings, array: np.ndarray) -> np.ndarray:
+    """[R, S] or [R, E, S] as [E * S, R], or as [E * S] if R = 1: half the time of one column.
+
+    Raises:
+        ValueError: another shape, or numbers that are not finite.
+    """
+    e, n, _ = settings.shape
+    array = np.asarray(array, dtype=np.float64)
+    if array.shape[1:] not in ((n,), (e, n)):
+        raise ValueError(f"reward must be [R, {n}] or [R, {e}, {n}], not {list(array.shape)}")
+    if not np.isfinite(array).all():
+        raise ValueError("the reward is not finite")
+    if array.ndim == 2:
+        array = np.broadcast_to(array[:, None], (len(array), e, n))
+    if len(array) == 1:
+        return array.reshape(e * n)
+    return np.ascontiguousarray(array.reshape(-1, e * n).T)
+
+
+def runs_first(settings: Settings, array: np.ndarray) -> np.ndarray:
+    """[E * S, R] or [E * S] as [R, E, S]."""
+    e, n, _ = settings.shape
+    return np.ascontiguousarray(array.reshape(e * n, -1).T).reshape(-1, e, n)
+
+
+def check_size(horizon: int, discount: float, numbers: int) -> None:
+    """Refuse what :func:`backward` cannot solve, or what keeps too many ``numbers`` per step.
+
+    Raises:
+        ValueError: a horizon below 1, a discount outside (0, 1], or more than ``MEMORY_LIMIT``.
+    """
+    if horizon < 1:
+        raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
+    if not 0.0 < discount <= 1.0:
+        raise ValueError(f"the discount must lie in (0, 1], not {discount}")
+    size = 8 * horizon * numbers
+    if size > MEMORY_LIMIT:
+        raise ValueError(
+            f"too many states, steps or runs for the exact solver: it would keep "
+            f"{size / 2**30:.0f} GiB, the limit is {MEMORY_LIMIT / 2**30:.0f}"
+        )

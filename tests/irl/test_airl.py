@@ -1,0 +1,252 @@
+"""Adversarial IRL: definitions, absorbing states in closed form, the optimal discriminator."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from irlcli.envs.lunar_lander import LunarLander
+from irlcli.irl import airl
+from irlcli.irl.networks import Normaliser, RewardModel
+from irlcli.trajectories import Transitions, join
+
+GAMMA = 0.9
+
+
+def make_model(state_only=False, discrete=True, seed=0):
+    torch.manual_seed(seed)
+    return RewardModel(8, 4, discrete, state_only, [16], "tanh", GAMMA)
+
+
+def make_transitions(count, terminated=(), remaining=5, seed=0):
+    rng = np.random.default_rng(seed)
+    ends = np.zeros(count, dtype=bool)
+    ends[list(terminated)] = True
+    return Transitions(
+        observations=rng.normal(size=(count, 8)).astype(np.float32),
+        actions=rng.integers(4, size=count),
+        next_observations=rng.normal(size=(count, 8)).astype(np.float32),
+        terminated=ends,
+        remaining=np.where(ends, remaining, 0),
+    )
+
+
+def as_tensors(model, data):
+    return (
+        torch.as_tensor(data.observations),
+        model.encode(torch.as_tensor(data.actions)),
+        torch.as_tensor(data.next_observations),
+        torch.as_tensor(data.terminated, dtype=torch.float32),
+    )
+
+
+@pytest.mark.parametrize("state_only", [False, True])
+def test_f_is_g_plus_shaping(state_only):
+    model = make_model(state_only)
+    data = make_transitions(6, terminated=[2])
+    s, a, s_next, ends = as_tensors(model, data)
+    g = model.g(s if state_only else torch.cat([s, a], -1))[:, 0]
+    h, h_next = model.h(s)[:, 0], model.h(s_next)[:, 0]
+    expected = g + GAMMA * h_next * torch.tensor([1.0, 1, 0, 1, 1, 1]) - h
+    torch.testing.assert_close(model(s, a, s_next, ends), expected)
+
+
+def test_state_only_reward_ignores_actions():
+    model = make_model(state_only=True)
+    s = torch.randn(5, 8)
+    a = model.encode(torch.arange(5) % 4)
+    torch.testing.assert_close(model.reward(s, a), model.reward(s, torch.zeros(5, 4)))
+
+
+def test_variable_horizon_reward_forms():
+    model = make_model()
+    data = make_transitions(6, terminated=[1])
+    log_probs = -torch.rand(6)
+    f = model(*as_tensors(model, data))
+    g = model.reward(*as_tensors(model, data)[:2])
+    for form, expected in {"f": f, "g": g, "f-log-pi": f - log_probs}.items():
+        reward = airl.policy_reward(model, data, log_probs, form, False, GAMMA)
+        torch.testing.assert_close(reward, expected)
+        assert not reward.requires_grad
+
+
+@pytest.mark.parametrize("form", ["f-log-pi", "f", "g"])
+def test_absorbing_value_equals_stepping_the_environment(form):
+    # Step a fixed-horizon lander into the ground and far beyond, and add up what the absorbing
+    # steps pay; the closed form must give as much at the step of the crash.
+    horizon = 400
+    env = LunarLander(fixed_horizon=horizon)
+    observation, _ = env.reset(seed=1)
+    observations = [observation]
+    for _ in range(horizon):
+        observations.append(env.step(0)[0])
+    stacked = np.array(observations)
+    repeats = (stacked[1:] == stacked[:-1]).all(-1)
+    crash = int(np.flatnonzero(repeats)[0]) - 1
+    assert horizon - crash > 250  # 0.9 ** 250 is nothing: the horizon may count as infinite
+
+    model = make_model()
+    model.normaliser.update(torch.as_tensor(stacked))
+    data = Transitions(
+        stacked[crash : crash + 1],
+        np.zeros(1, dtype=np.int64),
+        stacked[crash + 1 : crash + 2],
+        np.array([True]),
+        np.array([horizon - crash - 1]),
+    )
+    log_probs = torch.tensor([-1.2])
+    closed = airl.policy_reward(model, data, log_probs, form, True, GAMMA).item()
+
+    s = torch.as_tensor(stacked[crash:])
+    actions = torch.zeros(len(s) - 1, 4)
+    actions[0, 0] = 1.0  # the crash itself was an action; absorbing states have none
+    with torch.no_grad():
+        f = model(s[:-1], actions, s[1:], torch.zeros(len(s) - 1))
+        paid = model.reward(s[:-1], actions) if form == "g" else f
+    if form == "f-log-pi":
+        paid[0] += 1.2
+    discounts = GAMMA ** torch.arange(len(paid), dtype=torch.float64)
+    assert closed == pytest.approx((discounts * paid).sum().item(), rel=1e-4, abs=1e-5)
+
+
+def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
+    model = make_model()
+    data = make_transitions(10, terminated=[3, 7], remaining=6)
+    log_probs = -torch.rand(10)
+    pool = airl.make_pool(model, data, log_probs, absorbing=True)
+    counts = torch.bincount(pool.draw, minlength=12)
+    assert counts.tolist() == [1] * 10 + [6, 6]
+    assert pool.terminated.sum() == 0
+    assert pool.actions[10:].abs().sum() == 0
+    assert pool.log_probs[10:].tolist() == [0.0, 0.0]
+    np.testing.assert_array_equal(pool.observations[10].numpy(), data.next_observations[3])
+
+    plain = airl.make_pool(model, data, log_probs, absorbing=False)
+    assert plain.draw.tolist() == list(range(10))
+    assert plain.terminated.sum() == 2
+
+
+def test_join_pools_keeps_rows_and_weights():
+    model = make_model()
+    parts = [make_transitions(4, [1], 3, seed=s) for s in range(2)]
+    pools = [airl.make_pool(model, d, torch.zeros(4), True) for d in parts]
+    joined = airl.join_pools(pools)
+    whole = torch.cat([p.observations[p.draw] for p in pools])
+    torch.testing.assert_close(joined.observations[joined.draw], whole)
+
+
+def test_minibatch_layout_and_share_of_the_past():
+    model = make_model()
+
+    def constant(value):
+        data = make_transitions(20)
+        observations = np.full_like(data.observations, value)
+        data = Transitions(
+            observations,
+            *[
+                getattr(data, n)
+                for n in ("actions", "next_observations", "terminated", "remaining")
+            ],
+        )
+        return airl.make_pool(model, data, torch.zeros(20), False)
+
+    batch = airl.sample_minibatch(
+        [constant(0), constant(1)],
+        [constant(2), constant(3)],
+        8,
+        torch.Generator().manual_seed(0),
+        [constant(4), constant(5)],
+        0.25,
+    )
+    assert batch.observations.shape == (2, 2, 8, 8)
+    assert batch.observations[..., 0].int().tolist() == [
+        [[0] * 6 + [4] * 2, [2] * 8],
+        [[1] * 6 + [5] * 2, [3] * 8],
+    ]
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 20.0])
+def test_total_loss_is_the_papers_divided_by_lambda(weight):
+    torch.manual_seed(0)
+    logit, f = torch.randn(2, 2, 6), torch.randn(2, 2, 6)
+    losses = airl.discriminator_losses(logit, f, weight, "reward", unbiased=False)
+    expected = losses.cross_entropy.mean() + weight * losses.penalty.mean()
+    torch.testing.assert_close(losses.total, expected / max(1.0, weight))
+    correct = ((logit[:, 1] > 0).float().mean(-1) + (logit[:, 0] < 0).float().mean(-1)) / 2
+    torch.testing.assert_close(losses.accuracy, correct)
+
+
+def test_penalty_weight_schedule():
+    weights = [airl.penalty_weight_at(r, 8.0, warmup=2, ramp=4) for r in range(8)]
+    assert weights == [0.0, 0.0, 2.0, 4.0, 6.0, 8.0, 8.0, 8.0]
+    assert airl.penalty_weight_at(0, 8.0, warmup=0, ramp=0) == 8.0
+
+
+def test_trained_discriminator_is_the_density_ratio():
+    # Two states; the expert is in the first 4 of 5 times, the policy 1 of 2. At the optimum
+    # f - log pi = log rho_E / rho_pi (Goodfellow et al. 2014, Prop. 1).
+    torch.manual_seed(0)
+    model = RewardModel(1, 2, True, False, [8], "tanh", GAMMA)
+
+    def pool(states):
+        observations = torch.tensor(states, dtype=torch.float32)[:, None]
+        count = len(states)
+        actions = torch.zeros(count, 2)
+        actions[:, 0] = 1.0
+        log_probs = torch.full((count,), math.log(0.5))
+        return airl.Pool(
+            observations, actions, observations, torch.ones(count), log_probs, torch.arange(count)
+        )
+
+    policy, expert = pool([1, 1, 1, 1, 1, -1, -1, -1, -1, -1]), pool([1] * 8 + [-1] * 2)
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.01)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(600):
+        batch = airl.sample_minibatch([policy], [expert], 256, generator)
+        losses = airl.discriminator_losses(*airl.logits(model, batch), 0.0)
+        optimizer.zero_grad()
+        losses.total.backward()
+        optimizer.step()
+    f = model(policy.observations, policy.actions, policy.observations, policy.terminated)
+    ratio = (f - policy.log_probs).detach()
+    assert ratio[0].item() == pytest.approx(math.log(0.8 / 0.5), abs=0.15)
+    assert ratio[-1].item() == pytest.approx(math.log(0.2 / 0.5), abs=0.15)
+
+
+def test_reward_scale_is_the_deviation_over_draws():
+    model = make_model()
+    data = make_transitions(12, terminated=[4], remaining=7)
+    pool = airl.make_pool(model, data, torch.zeros(12), True)
+    with torch.no_grad():
+        g = model.reward(pool.observations, pool.actions).numpy().astype(float)
+    repeated = np.concatenate([g[:12], np.repeat(g[12:], 7)])
+    assert airl.reward_scale(model, [pool]) == pytest.approx(repeated.std(ddof=1))
+
+
+def test_normaliser_moments_do_not_depend_on_the_batching():
+    data = torch.randn(100, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor([3.0, 0.0, -7.0])
+    whole, parts = Normaliser(3), Normaliser(3)
+    whole.update(data)
+    for part in data.split([1, 30, 69]):
+        parts.update(part)
+    torch.testing.assert_close(whole.mean, data.double().mean(0))
+    torch.testing.assert_close(whole.variance, data.double().var(0, unbiased=False))
+    torch.testing.assert_close(parts.variance, whole.variance)
+    out = whole(data)
+    assert out.dtype == torch.float32
+    torch.testing.assert_close(out.mean(0), torch.zeros(3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(out.std(0, unbiased=False), torch.ones(3), atol=1e-4, rtol=0)
+
+
+def test_a_constant_observation_stays_finite():
+    normaliser = Normaliser(2)
+    normaliser.update(torch.tensor([[1.0, 0.0], [2.0, 0.0]]))
+    assert normaliser(torch.tensor([[1.5, 1.0]])).tolist() == [[0.0, 10.0]]
+
+
+def test_join_is_concatenation():
+    a, b = make_transitions(3, seed=1), make_transitions(2, seed=2)
+    joined = join([a, b])
+    np.testing.assert_array_equal(joined.actions, [*a.actions, *b.actions])
+    np.testing.assert_array_equal(joined.take(np.array([3])).observations, b.observations[:1])

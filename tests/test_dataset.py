@@ -1,0 +1,195 @@
+"""Demonstrations in Parquet: what goes in comes out, and damage does not pass."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from irlcli.dataset import (
+    EPISODES,
+    STEPS,
+    read_demonstrations,
+    read_metadata,
+    write_demonstrations,
+)
+from irlcli.errors import IntegrityError
+from irlcli.interventions import parse_settings
+from irlcli.trajectories import Trajectory, transitions
+
+SETTINGS = parse_settings("lunar-lander", "bounce=0.1,0.5")
+
+
+def make_trajectory(steps, seed=0, discrete=True, terminated=True, size=8):
+    rng = np.random.default_rng(seed)
+    actions = (
+        rng.integers(4, size=steps)
+        if discrete
+        else rng.normal(size=(steps, 3)).astype(np.float32) * 2
+    )
+    return Trajectory(
+        observations=rng.normal(size=(steps + 1, size)).astype(np.float32),
+        actions=actions,
+        rewards=rng.normal(size=steps),
+        terminated=terminated,
+        truncated=not terminated,
+        seed=seed,
+    )
+
+
+def write(directory, discrete=True):
+    groups = [
+        (SETTINGS[0], [make_trajectory(5, 1, discrete), make_trajectory(1, 2, discrete, False)]),
+        (SETTINGS[1], [make_trajectory(9, 3, discrete)]),
+    ]
+    directory.mkdir(exist_ok=True)
+    write_demonstrations(directory, "lunar-lander", groups, {"experts": {"bounce=0.1": "abc"}})
+    return groups
+
+
+@pytest.mark.parametrize("discrete", [True, False])
+def test_round_trip(tmp_path, discrete):
+    groups = write(tmp_path, discrete)
+    demos = read_demonstrations(tmp_path)
+    assert demos.env == "lunar-lander"
+    assert demos.metadata["experts"] == {"bounce=0.1": "abc"}
+    assert list(demos.trajectories) == [str(s) for s, _ in groups]
+    for setting, written in groups:
+        for a, b in zip(written, demos.trajectories[str(setting)], strict=True):
+            for name in ("observations", "actions", "rewards"):
+                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+                assert getattr(a, name).dtype == getattr(b, name).dtype
+            assert (a.terminated, a.truncated, a.seed) == (b.terminated, b.truncated, b.seed)
+
+
+@settings(max_examples=25, deadline=None)
+@given(lengths=st.lists(st.integers(1, 30), min_size=1, max_size=6), seed=st.integers(0, 2**31))
+def test_any_lengths_round_trip(tmp_path_factory, lengths, seed):
+    directory = tmp_path_factory.mktemp("demos")
+    group = [make_trajectory(n, (seed + i) % 2**31, size=3) for i, n in enumerate(lengths)]
+    write_demonstrations(directory, "lunar-lander", [(SETTINGS[0], group)], {})
+    (read,) = read_demonstrations(directory).trajectories.values()
+    assert [len(t) for t in read] == lengths
+    assert [t.episode_return for t in read] == [t.episode_return for t in group]
+
+
+def test_form_on_disk(tmp_path):
+    write(tmp_path, discrete=False)
+    file = pq.ParquetFile(tmp_path / STEPS)
+    assert file.num_row_groups == 3
+    assert file.metadata.row_group(0).column(0).compression == "ZSTD"
+    fields = {f.name: f for f in file.schema_arrow}
+    assert fields["obs"].type == pa.list_(pa.float32(), 8)
+    assert fields["action"].type == pa.list_(pa.float32(), 3)
+    assert fields["reward"].type == pa.float64()
+    assert fields["episode"].type == fields["t"].type == pa.int32()
+    assert not any(f.nullable for f in file.schema_arrow)
+    episodes = pq.read_table(tmp_path / EPISODES)
+    assert episodes["intervention"].to_pylist() == [[0.1], [0.1], [0.5]]
+    assert episodes["length"].to_pylist() == [5, 1, 9]
+
+
+def test_equal_demonstrations_are_equal_bytes(tmp_path):
+    write(tmp_path / "a")
+    write(tmp_path / "b")
+    for name in (STEPS, EPISODES):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", [STEPS, EPISODES])
+@pytest.mark.parametrize("damage", ["truncate", "empty", "delete", "text", "flip"])
+def test_damage_is_an_integrity_error(tmp_path, name, damage):
+    write(tmp_path)
+    path = tmp_path / name
+    data = bytearray(path.read_bytes())
+    if damage == "truncate":
+        path.write_bytes(data[: len(data) // 2])
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "delete":
+        path.unlink()
+    elif damage == "text":
+        path.write_text("no parquet at all")
+    else:
+        # Inside the first data page, which its checksum covers.
+        data[60] ^= 0x10
+        path.write_bytes(data)
+    with pytest.raises(IntegrityError):
+        read_demonstrations(tmp_path)
+
+
+def rewrite_tags(directory, **changes):
+    table = pq.read_table(directory / EPISODES)
+    tags = json.loads(table.schema.metadata[b"irlcli"])
+    metadata = {b"irlcli": json.dumps({**tags, **changes}).encode()}
+    pq.write_table(table.replace_schema_metadata(metadata), directory / EPISODES)
+
+
+def test_newer_schema_says_so(tmp_path):
+    write(tmp_path)
+    rewrite_tags(tmp_path, schema=99)
+    with pytest.raises(IntegrityError, match="newer") as caught:
+        read_metadata(tmp_path)
+    assert "upgrade" in caught.value.hint
+
+
+def test_steps_and_episodes_must_fit(tmp_path):
+    write(tmp_path)
+    table = pq.read_table(tmp_path / EPISODES)
+    returns = table["return"].to_pylist()
+    returns[1] += 1.0
+    column = table.schema.get_field_index("return")
+    wrong = table.set_column(column, table.schema.field(column), pa.array(returns))
+    pq.write_table(wrong, tmp_path / EPISODES)
+    with pytest.raises(IntegrityError, match="does not add up"):
+        read_demonstrations(tmp_path)
+
+
+def test_nothing_to_write_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no trajectory"):
+        write_demonstrations(tmp_path, "lunar-lander", [(SETTINGS[0], [])], {})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": np.zeros((3, 2), np.float32)}, "need observations"),
+        ({"actions": np.zeros(5, np.int64)}, "need 3 actions"),
+        ({"rewards": np.zeros(0)}, "at least one step"),
+        ({"rewards": np.array([0.0, np.nan, 0.0])}, "rewards are not finite"),
+        ({"observations": np.zeros((4, 2))}, "float32"),
+        ({"actions": np.zeros(3, np.int32)}, "int64 or float32"),
+        ({"truncated": True}, "either terminated or truncated"),
+    ],
+)
+def test_trajectories_are_validated(changes, message):
+    fields = {
+        "observations": np.zeros((4, 2), np.float32),
+        "actions": np.zeros(3, np.int64),
+        "rewards": np.zeros(3),
+        "terminated": True,
+        "truncated": False,
+        "seed": 0,
+    }
+    with pytest.raises(ValueError, match=message):
+        Trajectory(**{**fields, **changes})
+
+
+def test_trajectories_are_frozen():
+    with pytest.raises(ValueError, match="read-only"):
+        make_trajectory(3).rewards[0] = 1.0
+
+
+def test_transitions_know_what_was_left_of_the_horizon():
+    data = transitions([make_trajectory(4), make_trajectory(3, terminated=False)], horizon=10)
+    assert data.terminated.tolist() == [False] * 3 + [True] + [False] * 3
+    assert data.remaining.tolist() == [0, 0, 0, 6, 0, 0, 0]
+    first = make_trajectory(4)
+    np.testing.assert_array_equal(data.next_observations[:4], first.observations[1:])
+    with pytest.raises(ValueError, match="exceeds the horizon"):
+        transitions([make_trajectory(11)], horizon=10)
+    with pytest.raises(ValueError, match="at least one"):
+        transitions([], horizon=10)

@@ -1,0 +1,159 @@
+"""Killed and interrupted stages go on, and end in the same bytes as if nothing had happened."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from irlcli.runner import Runner
+from irlcli.store import Store
+
+# The real stages at the smoke profile, checkpointing after every round; prints the id.
+CHAIN = """
+import sys
+from irlcli.interventions import parse_setting, parse_settings
+from irlcli.runner import Runner
+from irlcli.settings import load_settings
+from irlcli.stages import From, collect_experts, train_airl, transfer
+
+def request(stage):
+    config = load_settings("lunar-lander", "smoke")
+    settings = parse_settings("lunar-lander", "engine-power=1x,1.25x")
+    demos = collect_experts.request("lunar-lander", settings, config)
+    if stage == "collect-experts":
+        return demos
+    reward = train_airl.request(From(demos), "lunar-lander", settings, config.airl, seed=3)
+    if stage == "train-airl":
+        return reward
+    setting = parse_setting("lunar-lander", "engine-power=1.5x")
+    return transfer.request(
+        From(reward, "reward.pt"), "lunar-lander", setting, config.transfer, seed=3
+    )
+"""
+RUN = (
+    CHAIN
+    + """
+runner = Runner(sys.argv[1], command=["irl", "test"], checkpoint_seconds=0.0)
+print(runner.run(request(sys.argv[2])).manifest.id)
+"""
+)
+
+
+def start(store, stage):
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN, str(store), stage],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process):
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return output.strip()
+
+
+def checkpoints(store):
+    """Paths and modification times of all checkpoints now."""
+    found = {}
+    for path in Path(store).glob(".work/*/checkpoint"):
+        try:
+            found[path] = path.stat().st_mtime_ns
+        except FileNotFoundError:
+            pass
+    return found
+
+
+def kill_after_checkpoint(store, process):
+    """SIGKILL the process right after it wrote a checkpoint; False if it ended before."""
+    before = checkpoints(store)
+    while process.poll() is None:
+        now = checkpoints(store)
+        if any(before.get(path) != stamp for path, stamp in now.items()):
+            os.kill(process.pid, signal.SIGKILL)
+            process.communicate()
+            return True
+        time.sleep(0.001)
+    process.communicate()
+    return False
+
+
+def test_killed_stages_end_in_the_same_bytes(tmp_path):
+    undisturbed = finish(start(tmp_path / "a", "transfer"))
+    for stage in ("collect-experts", "train-airl", "transfer"):
+        # One round at least is left after either kill, so that resuming is what finishes it.
+        assert kill_after_checkpoint(tmp_path / "b", start(tmp_path / "b", stage)), stage
+        kill_after_checkpoint(tmp_path / "b", start(tmp_path / "b", stage))
+        last = finish(start(tmp_path / "b", stage))
+    assert last == undisturbed
+    a, b = Store(tmp_path / "a"), Store(tmp_path / "b")
+    assert a.ids() == b.ids()
+    assert not b.verify(b.ids())
+    resumed = {a.manifest.record.stage for a in b.artefacts() if a.provenance()["resumed"]}
+    assert resumed == {"train-expert", "train-airl", "transfer"}
+    assert not any(artefact.provenance()["resumed"] for artefact in a.artefacts())
+
+
+def irl(*arguments):
+    return [sys.executable, "-m", "irlcli", *arguments]
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_exit_130(tmp_path):
+    arguments = ["collect-experts", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
+    arguments += ["--profile", "smoke", "--set", "expert.total_steps=200000"]
+    arguments += ["--store", str(tmp_path / "runs")]
+    process = subprocess.Popen(
+        irl(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    for line in process.stderr:
+        # The second report: at least one round is done, a million steps are not.
+        if "steps/s" in line or "/200," in line:
+            break
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert output == ""
+    assert "checkpoint was written" in errors and "hint:" in errors
+    assert "Traceback" not in errors
+    plan = subprocess.run(
+        irl(*arguments, "--dry-run"), capture_output=True, text=True, check=True
+    ).stdout
+    assert plan.startswith("RESUME  train-expert")
+    assert "BLOCKED collect-experts" in plan
+
+
+def test_a_damaged_checkpoint_is_said_aloud_and_not_used(tmp_path):
+    process = start(tmp_path, "collect-experts")
+    assert kill_after_checkpoint(tmp_path, process)
+    (path,) = checkpoints(tmp_path)
+    path.write_bytes(path.read_bytes()[:-1] + b"\x00\x01")
+    warnings = []
+
+    class Console:
+        def __getattr__(self, name):
+            return lambda *arguments, **keywords: None
+
+        def warn(self, message):
+            warnings.append(message)
+
+    namespace = {}
+    exec(CHAIN, namespace)
+    artefact = Runner(tmp_path, Console()).run(namespace["request"]("collect-experts"))
+    assert any("damaged" in w and "starting over" in w for w in warnings)
+    assert artefact.manifest.id == finish(start(tmp_path / "other", "collect-experts"))
+
+
+@pytest.mark.parametrize("workers", [3])
+def test_processes_that_ask_for_the_same_artefact_share_the_work(tmp_path, workers):
+    processes = [start(tmp_path, "collect-experts") for _ in range(workers)]
+    ids = {finish(p) for p in processes}
+    assert len(ids) == 1
+    store = Store(tmp_path)
+    assert len(store.ids()) == 3  # two experts and the dataset, each made once
+    assert not list(tmp_path.glob(".work/*"))
+    assert not store.verify(store.ids())

@@ -1,0 +1,167 @@
+"""Rounds of PPO: recorded transitions, replaced rewards, seeds, resuming, saved policies."""
+
+import numpy as np
+import pytest
+import torch
+
+from irlcli import rl
+from irlcli.checkpoints import from_bytes, to_bytes
+from irlcli.interventions import parse_settings
+from irlcli.settings import PPOSettings
+
+SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.25x")
+PPO = PPOSettings(n_envs=4, n_steps=128, batch_size=128, n_epochs=2, rollouts_per_round=2)
+
+
+def make_trainer(seed=0, limit=None, **changes):
+    ppo = PPOSettings(**{**{f: getattr(PPO, f) for f in PPO.__struct_fields__}, **changes})
+    worlds = rl.make_worlds("lunar-lander", SETTINGS, ppo.n_envs)
+    if limit is not None:
+        worlds.max_episode_steps = limit
+    return rl.PPOTrainer(worlds, ppo, 8192, seed)
+
+
+def same(a, b):
+    return to_bytes(a.state_dict()) == to_bytes(b.state_dict())
+
+
+def test_rollouts_hold_true_successors_and_the_sampling_policys_log_probs():
+    trainer = make_trainer(limit=50)
+    seen = []
+
+    def reward(rollout):
+        # Called before the update: the policy is still the one that acted.
+        observations = torch.as_tensor(rollout.observations).flatten(0, 1)
+        actions = torch.as_tensor(rollout.actions).flatten()
+        log_probs = trainer.policy.log_prob(observations, actions).numpy()
+        np.testing.assert_allclose(rollout.log_probs.ravel(), log_probs, atol=1e-5)
+        seen.append(rollout)
+        return rollout.true_rewards
+
+    trainer.train_round(0, reward)
+    assert len(seen) == 2
+    for rollout in seen:
+        ends = rollout.terminated | rollout.truncated
+        assert ends.any() and not (rollout.terminated & rollout.truncated).any()
+        np.testing.assert_array_equal(ends, rollout.lengths > 0)
+        assert rollout.lengths.max() <= 50
+        assert (rollout.lengths[rollout.truncated] == 50).all()
+        moved = ~ends[:-1]
+        np.testing.assert_array_equal(
+            rollout.next_observations[:-1][moved], rollout.observations[1:][moved]
+        )
+        # Where an episode ended, the successor is its last observation, not the next one's first.
+        changed = rollout.next_observations[:-1][ends[:-1]] != rollout.observations[1:][ends[:-1]]
+        assert changed.any(-1).all()
+
+
+def test_returns_are_those_of_whole_episodes():
+    rollout = make_trainer(limit=40).train_round(0)[0]
+    world = 1
+    ends = np.flatnonzero(rollout.lengths[:, world])
+    start = 0
+    for end in ends:
+        assert rollout.lengths[end, world] == end - start + 1
+        total = rollout.true_rewards[start : end + 1, world].sum()
+        assert rollout.returns[end, world] == pytest.approx(total)
+        start = end + 1
+
+
+def test_training_on_true_rewards_handed_in_equals_training_on_the_environments():
+    # Truncations (limit 50) and terminations both occur, so bootstrapping is compared as well.
+    plain, replaced = make_trainer(limit=50), make_trainer(limit=50)
+    plain.train_round(0)
+    replaced.train_round(0, lambda rollout: rollout.true_rewards)
+    for a, b in zip(
+        plain.policy.state_dict().values(), replaced.policy.state_dict().values(), strict=True
+    ):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+
+
+def test_same_seed_same_bytes_other_seed_other_bytes():
+    a, b, c = make_trainer(1), make_trainer(1), make_trainer(2)
+    for trainer in (a, b, c):
+        trainer.train_round(0)
+    assert same(a, b)
+    assert not same(a, c)
+
+
+def test_a_resumed_trainer_equals_an_uninterrupted_one():
+    through, first = make_trainer(), make_trainer()
+    for index in range(3):
+        through.train_round(index)
+    first.train_round(0)
+    stored = to_bytes(first.state_dict())
+    resumed = make_trainer()
+    resumed.load_state_dict(from_bytes(stored))
+    for index in (1, 2):
+        resumed.train_round(index)
+    assert same(through, resumed)
+    assert resumed.steps == 3 * resumed.steps_per_round
+
+
+def test_linear_schedules_fall_to_zero():
+    trainer = make_trainer(
+        learning_rate_schedule="linear", clip_range_schedule="linear", ent_coef_schedule="linear"
+    )
+    rates = []
+    for index in range(trainer.rounds):
+        trainer.train_round(index)
+        rates.append(trainer.model.policy.optimizer.param_groups[0]["lr"])
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] == pytest.approx(0.0)
+    assert trainer.model.ent_coef == pytest.approx(0.0)
+
+
+def test_policies_survive_saving():
+    trainer = make_trainer()
+    trainer.train_round(0)
+    stored = from_bytes(to_bytes(trainer.policy.state_dict()))
+    policy = rl.load_policy(rl.Policy.describe("lunar-lander", trainer.ppo), stored)
+    observations = np.random.default_rng(0).normal(size=(20, 8)).astype(np.float32)
+    np.testing.assert_array_equal(
+        policy.act(observations, deterministic=True),
+        trainer.policy.act(observations, deterministic=True),
+    )
+    actions = torch.as_tensor(policy.act(observations))
+    torch.testing.assert_close(
+        policy.log_prob(torch.as_tensor(observations), actions),
+        trainer.policy.log_prob(torch.as_tensor(observations), actions),
+    )
+
+
+@pytest.mark.parametrize("agent", ["random", "idle"])
+def test_roll_out_is_reproducible_and_whole(agent):
+    first, second = (
+        rl.roll_out("lunar-lander", SETTINGS[0], agent, 3, seed=5, parallel=2) for _ in range(2)
+    )
+    assert len({t.seed for t in first}) == 3
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.observations, b.observations)
+        np.testing.assert_array_equal(a.actions, b.actions)
+        assert a.terminated != a.truncated
+    if agent == "idle":
+        assert all((t.actions == 0).all() for t in first)
+
+
+def test_idle_episode_equals_gymnasiums():
+    import gymnasium
+
+    (trajectory,) = rl.roll_out("lunar-lander", SETTINGS[1], "idle", 1, seed=9)
+    env = gymnasium.make("irlcli/LunarLander-v0", engine_power=1.25)
+    observation, _ = env.reset(seed=trajectory.seed)
+    total = 0.0
+    for t in range(len(trajectory)):
+        np.testing.assert_array_equal(trajectory.observations[t], observation)
+        observation, reward, terminated, truncated, _ = env.step(0)
+        total += reward
+    assert terminated or truncated
+    assert trajectory.episode_return == pytest.approx(total)
+
+
+def test_not_a_number_in_the_rewards_is_a_named_failure():
+    from irlcli.errors import StageFailed
+
+    trainer = make_trainer()
+    with pytest.raises(StageFailed, match="not finite after an update in round 0"):
+        trainer.train_round(0, lambda rollout: np.full(rollout.terminated.shape, np.nan))
