@@ -37,7 +37,7 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.startup
 
 # LunarLander with two engine powers to learn from and a third, unseen one to transfer to.
-# One seed and a fifth of the standard budget: a look at the whole chain, not a comparison.
+# One seed and about half the standard budget: a look at the whole chain, not a comparison.
 DEMO_SETTINGS := --settings settings/demo/lunar-lander.toml
 demo: $(READY)
 	@$(MAKE) --no-print-directory -j2 TERM=dumb PROFILE=standard SEEDS=0 METHODS="erm irm" \
