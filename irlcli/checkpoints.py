@@ -18,6 +18,7 @@ from typing import Any
 import torch
 
 from irlcli.errors import IntegrityError, UsageError
+from irlcli.interventions import parse_setting
 from irlcli.irl.networks import RewardModel
 from irlcli.rl import Policy, load_policy
 
@@ -103,8 +104,9 @@ def load_policy_file(path: Path) -> tuple[Policy, dict[str, Any]]:
     """
     description, state = load(path, "policy")
     try:
-        return load_policy(description["network"], state), description
-    except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+        setting = parse_setting(description["env"], description["settings"][0])
+        return load_policy(description["network"], state, setting), description
+    except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise _misfit(path, error) from None
 
 

@@ -34,6 +34,7 @@ class Session:
         wait: bool = True,
         quiet: bool = False,
         tensorboard: Path | None = None,
+        workers: int = 1,
     ):
         from irlcli.store import Store
 
@@ -44,6 +45,7 @@ class Session:
         self._overrides = list(overrides)
         self._dry_run = dry_run
         self._wait = wait
+        self._workers = workers
         self._console = out.TerminalConsole(quiet, tensorboard)
 
     def settings(self, env: str, flags: dict[str, Any] | None = None):
@@ -56,7 +58,7 @@ class Session:
         """Run requests (or plan them, with --dry-run) and print one line for each."""
         from irlcli.runner import Runner
 
-        runner = Runner(self.store, self._console, self._wait)
+        runner = Runner(self.store, self._console, self._wait, workers=self._workers)
         if self._dry_run:
             self._print_plan([step for request in requests for step in runner.plan(request)])
             return []
@@ -126,6 +128,7 @@ def _common_options(runs: bool) -> list[inspect.Parameter]:
             option("overrides", [], list[str], "FIELD=VALUE, repeatable.", "--set"),
             option("dry_run", False, bool, "Say what would be done.", "--dry-run"),
             option("wait", True, bool, "Wait for a process making the same.", "--wait/--no-wait"),
+            option("workers", 1, int, "Processes that step environments.", "--workers", min=1),
             option("quiet", False, bool, "No progress on stderr.", "--quiet"),
             option("tensorboard", None, Path | None, "Mirror metrics here.", "--tensorboard"),
         ]

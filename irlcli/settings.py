@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from irlcli.errors import UsageError, suggest
 from irlcli.interventions import environment, parse_settings
@@ -52,6 +52,13 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     net_arch: Widths = (64, 64)
     activation: Activation = "tanh"
     ortho_init: bool = True
+    # For continuous actions. Unset is off (or SB3's default) and not part of an artefact's key:
+    # what was made before these settings existed is still found.
+    log_std_init: float | UnsetType = UNSET
+    normalise_observations: bool | UnsetType = UNSET
+    normalise_rewards: bool | UnsetType = UNSET
+    use_sde: bool | UnsetType = UNSET
+    sde_sample_freq: Count | UnsetType = UNSET
 
 
 class InterventionSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -287,4 +294,6 @@ def _field_hint(field: str) -> str:
         if not isinstance(value, Struct) or not hasattr(value, name):
             return "see settings/ for examples"
         value = getattr(value, name)
+    if value is UNSET:
+        return "it is unset by default"
     return f"its default is {msgspec.json.encode(value).decode()}"

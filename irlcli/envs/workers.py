@@ -171,9 +171,7 @@ class WorkerWorlds:
         """
         actions = np.asarray(actions)
         if actions.shape != self._actions.shape:
-            raise ValueError(
-                f"actions must have shape {self._actions.shape}, not {actions.shape}"
-            )
+            raise ValueError(f"actions must have shape {self._actions.shape}, not {actions.shape}")
         if not np.isfinite(actions).all():
             raise ValueError("actions must be finite")
         self._actions[:] = actions
@@ -219,9 +217,7 @@ class WorkerWorlds:
             process.join(_CLOSE_SECONDS)
             code = process.exitcode
             cause = f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
-            raise WorkerFailed(
-                f"worker {worker} ({self._worlds(worker)}) died: {cause}"
-            ) from None
+            raise WorkerFailed(f"worker {worker} ({self._worlds(worker)}) died: {cause}") from None
 
     def _worlds(self, worker: int) -> str:
         first, last = self._shares[worker]

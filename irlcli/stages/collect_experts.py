@@ -67,7 +67,7 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_demonstrations
-    from irlcli.stages.outputs import write_json
+    from irlcli.stages.outputs import shown, write_json
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
@@ -78,12 +78,16 @@ def run(job: Job) -> None:
         seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
         trajectories = rl.roll_out(p.env, setting, policy, episodes, seed, p.deterministic)
         returns = np.array([t.episode_return for t in trajectories])
+        for k, t in enumerate(trajectories):
+            if t.error is not None:
+                job.console.warn(f"{text}, episode {k}: {t.error}; the episode ended there")
         met = None if p.bar is None else bool(returns.mean() >= p.bar)
         if met is False:
             job.console.warn(
                 f"the expert of {p.env} {text} misses its bar: mean true return "
                 f"{returns.mean():.0f} over {episodes} episodes, bar {p.bar:.0f}"
             )
+        progress = float(np.mean([t.progress for t in trajectories]))
         groups.append((setting, trajectories))
         summary.append(
             {
@@ -91,12 +95,13 @@ def run(job: Job) -> None:
                 "episodes": episodes,
                 "mean_return": float(returns.mean()),
                 "std_return": float(returns.std()),
+                "mean_progress": None if np.isnan(progress) else progress,
                 "mean_length": float(np.mean([len(t) for t in trajectories])),
                 "bar": p.bar,
                 "bar_met": met,
             }
         )
-        facts = {text: f"return {returns.mean():.0f}"}
+        facts = {text: shown(returns.mean(), progress)}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {
         "experts": {text: file_digest(job.inputs[f"expert {text}"]) for text in p.settings},

@@ -49,7 +49,7 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_table
-    from irlcli.stages.outputs import write_json
+    from irlcli.stages.outputs import shown, write_json
 
     p: Parameters = job.parameters
     policy, origin = p.agent, {"agent": p.agent, "env": p.env}
@@ -66,12 +66,17 @@ def run(job: Job) -> None:
             seed,
             p.evaluation.deterministic,
         )
+        for k, t in enumerate(trajectories):
+            if t.error is not None:
+                job.console.warn(f"{text}, episode {k}: {t.error}; the episode ended there")
+        progress = float(np.mean([t.progress for t in trajectories]))
         rows += [
             {
                 "setting": text,
                 "episode": k,
                 "seed": t.seed,
                 "true_return": t.episode_return,
+                "progress": t.progress,
                 "length": len(t),
                 "terminated": t.terminated,
             }
@@ -84,12 +89,13 @@ def run(job: Job) -> None:
                 "episodes": len(returns),
                 "mean_return": float(returns.mean()),
                 "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
+                "mean_progress": None if np.isnan(progress) else progress,
                 "mean_length": float(np.mean([len(t) for t in trajectories])),
                 "terminated": float(np.mean([t.terminated for t in trajectories])),
             }
         )
         job.console.progress(
-            index + 1, len(p.settings), "settings", {text: f"return {returns.mean():.0f}"}
+            index + 1, len(p.settings), "settings", {text: shown(returns.mean(), progress)}
         )
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
     subject = {key: value for key, value in origin.items() if key not in ("network", "airl")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,12 @@ from irlcli.settings import PPOSettings
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as JSON with sorted keys."""
     path.write_text(json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n")
+
+
+def shown(true_return: float, progress: float) -> str:
+    """A true return as progress shows it, with the environment's progress if that is measured."""
+    measured = "" if math.isnan(progress) else f" progress {progress:.0f}"
+    return f"return {true_return:.0f}{measured}"
 
 
 def write_metrics(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -1,6 +1,7 @@
 """Adversarial IRL from demonstrations: ERM, ERM-balanced or IRM (paper Algorithm 1)."""
 
 from collections.abc import Sequence
+from contextlib import closing
 
 import msgspec
 
@@ -32,8 +33,14 @@ def request(
     ``metrics.parquet`` with one row per round and setting.
 
     Raises:
-        UsageError: the worlds cannot be shared equally by the settings.
+        UsageError: the worlds cannot be shared equally by the settings, or gSDE is asked for.
     """
+    if airl.ppo.use_sde:
+        raise UsageError(
+            "airl.ppo.use_sde: AIRL needs log pi(a|s) of the action taken, and gSDE's noise "
+            "outlasts a step",
+            "leave it unset; airl.ppo.log_std_init sets how much the policy explores",
+        )
     texts = tuple(str(s) for s in settings_)
     if airl.ppo.n_envs % len(texts):
         raise UsageError(
@@ -61,12 +68,11 @@ def run(job: Job) -> None:
             f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, not of "
             f"{p.env} {', '.join(settings)}"
         )
-    worlds = rl.make_worlds(
-        demos.env, [parse_setting(demos.env, s) for s in settings], p.airl.ppo.n_envs
-    )
-    trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
-    adversary = Adversary(demos, p.airl, worlds, p.seed)
-    rows = train_rounds(job, trainer, settings, adversary=adversary)
+    parsed = [parse_setting(demos.env, s) for s in settings]
+    with closing(rl.make_worlds(demos.env, parsed, p.airl.ppo.n_envs, job.workers)) as worlds:
+        trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
+        adversary = Adversary(demos, p.airl, worlds, p.seed)
+        rows = train_rounds(job, trainer, settings, adversary=adversary)
     origin = {
         "env": demos.env,
         "settings": settings,

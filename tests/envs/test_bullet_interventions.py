@@ -259,5 +259,3 @@ def test_absurd_values_are_refused(robot, arguments, message):
 def test_unknown_interventions_are_refused():
     with pytest.raises(TypeError):
         Reacher(mass=2.0)
-
-

@@ -92,9 +92,7 @@ def fly(name: str, model: str, steps: int, damping: float | None) -> tuple[np.nd
         )
     env.step(np.zeros(env.action_space.shape))
     random = np.random.default_rng(0)
-    taken = [
-        env.step(random.uniform(-1, 1, env.action_space.shape))[:2] for _ in range(steps)
-    ]
+    taken = [env.step(random.uniform(-1, 1, env.action_space.shape))[:2] for _ in range(steps)]
     env.close()
     return np.array([o for o, _ in taken]), np.array([r for _, r in taken])
 

@@ -126,9 +126,7 @@ def test_an_environments_error_names_worker_and_worlds():
 
 
 def test_a_dead_worker_is_noticed_and_the_others_are_ended():
-    worlds = WorkerWorlds(
-        [Fragile, partial(Fragile, die_at=2)], max_episode_steps=100, workers=2
-    )
+    worlds = WorkerWorlds([Fragile, partial(Fragile, die_at=2)], max_episode_steps=100, workers=2)
     pids = [process.pid for process in worlds._processes]
     worlds.reset([0, 0])
     worlds.step(np.zeros(2, dtype=np.int64))

@@ -218,9 +218,7 @@ class Ant(gymnasium.Env):
         self._observation, _, self._potential = self._observe()
         return self._observation, {}
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance 0.0165 s.
 
         Raises:

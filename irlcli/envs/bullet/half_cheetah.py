@@ -81,9 +81,7 @@ def _bounds(capsule: Capsule) -> np.ndarray:
     half_length = np.linalg.norm(half)
     sine, cosine = np.abs(half[[0, 2]]) / half_length
     reach = half_length + _RADIUS
-    extent = np.array(
-        [cosine * _RADIUS + sine * reach, _RADIUS, sine * _RADIUS + cosine * reach]
-    )
+    extent = np.array([cosine * _RADIUS + sine * reach, _RADIUS, sine * _RADIUS + cosine * reach])
     middle = np.array(capsule.center)
     return np.stack([middle - extent, middle + extent])
 
@@ -241,9 +239,7 @@ class HalfCheetah(gymnasium.Env):
         self._observation, self._forward = self._observe()
         return self._observation, {}
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance 0.0165 s.
 
         Raises:

@@ -101,9 +101,7 @@ class Reacher(gymnasium.Env):
         "render_fps": round(1.0 / TIME_STEP),
     }
 
-    def __init__(
-        self, gravity: float = 1.0, model: str = "merged", render_mode: str | None = None
-    ):
+    def __init__(self, gravity: float = 1.0, model: str = "merged", render_mode: str | None = None):
         self.gravity = require("gravity", gravity, 0.0, 20.0)
         self.model = require_model(model)
         self.render_mode = render_mode
@@ -137,9 +135,7 @@ class Reacher(gymnasium.Env):
         self._observation, self._potential = self._observe()
         return self._observation, {}
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance 0.0165 s.
 
         Raises:

@@ -123,8 +123,7 @@ def require_friction(friction: Sequence[float]) -> Friction:
         )
     names = ("friction (tangential)", "friction (torsional)", "friction (rolling)")
     first, second, third = (
-        single(require(name, value, 0.0, 10.0))
-        for name, value in zip(names, friction, strict=True)
+        single(require(name, value, 0.0, 10.0)) for name, value in zip(names, friction, strict=True)
     )
     return first, second, third
 
@@ -449,9 +448,7 @@ class Robot:
     def place(self, positions: Sequence[float]) -> None:
         """Set every joint read to a position, at rest."""
         for joint, position in zip(self.joints, positions, strict=True):
-            pybullet.resetJointState(
-                self.body, joint, position, 0.0, physicsClientId=self.client
-            )
+            pybullet.resetJointState(self.body, joint, position, 0.0, physicsClientId=self.client)
 
     def states(self) -> tuple[list[float], list[float]]:
         """Positions and velocities of the joints read."""
