@@ -359,6 +359,47 @@ def _settings(
     return parse_settings(env, f"{knob}={text}")
 
 
+@command("play", runs=False)
+def play(
+    session: Session,
+    policy: Annotated[str, typer.Argument(help="policy.pt or its artefact.")],
+    file: Annotated[Path, typer.Option("--out", help="GIF to write.")],
+    ood: Annotated[
+        str | None, typer.Option(help="VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB.")
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="At most this many.")] = 300,
+    seed: Seed = 0,
+) -> None:
+    """Draw a policy in the settings it was trained in, and in those of --ood beside them."""
+    from irlcli.interventions import parse_setting
+    from irlcli.references import tensor_file
+
+    source, origin = tensor_file(session.store, policy, "policy")
+    env = origin["env"]
+    settings = [parse_setting(env, text) for text in origin["settings"]]
+    if ood is not None:
+        added = _settings(env, session.settings(env), ood, "ood", origin)
+        settings += [setting for setting in added if setting not in settings]
+    if file.suffix.lower() != ".gif":
+        raise UsageError(f"{str(file)!r} does not end in .gif", "a GIF is what can be written")
+
+    from irlcli.checkpoints import load_policy_file
+    from irlcli.play import write_gif
+
+    player, _ = load_policy_file(source.path)
+    try:
+        write_gif(file, player, env, settings, steps, seed)
+    except OSError as error:
+        raise UsageError(
+            f"{file} cannot be written: {error.strerror or error}", "name another file with --out"
+        ) from None
+    if session.as_json:
+        played = {"path": str(file), "env": env, "settings": [str(s) for s in settings]}
+        out.print_json("play", played)
+    else:
+        out.print_data(str(file))
+
+
 @command("ls", runs=False)
 def ls(
     session: Session,
@@ -549,6 +590,7 @@ def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) 
                 "returns": list(row.returns),
                 "mean": row.mean,
                 "std_over_seeds": row.deviation,
+                "mean_progress": row.progress,
                 "episodes_per_seed": row.episodes,
             }
             for row in found
@@ -567,6 +609,10 @@ def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) 
         for row in found
     ]
     columns = ["agent", "setting", "true return", "sd over seeds", "seeds", "episodes each"]
+    if any(row.progress is not None for row in found):
+        columns.insert(3, "progress")
+        for cells, row in zip(table, found, strict=True):
+            cells.insert(3, "-" if row.progress is None else f"{row.progress:.1f}")
     out.print_table(columns, table, stderr=stderr)
 
 
