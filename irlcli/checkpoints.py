@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import IntegrityError, NewerFormat, UsageError
 from irlcli.interventions import parse_setting
 from irlcli.irl.networks import RewardModel
 from irlcli.rl import Policy, load_policy
@@ -61,11 +61,10 @@ def load(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
         )
     if value["kind"] != kind:
         raise UsageError(f"{path} is a {value['kind']}, not a {kind}", f"name a {kind} file")
-    if not isinstance(value["schema"], int) or value["schema"] > SCHEMA:
-        raise IntegrityError(
-            f"{path} has schema {value['schema']}, newer than the {SCHEMA} known here",
-            "it was written by a newer irlcli: upgrade this one",
-        )
+    if type(value["schema"]) is not int:
+        raise IntegrityError(f"{path} has no schema", f"a {kind} comes from a training stage")
+    if value["schema"] > SCHEMA:
+        raise NewerFormat(str(path), value["schema"], SCHEMA)
     try:
         description = json.loads(value["description"])
     except (TypeError, ValueError):

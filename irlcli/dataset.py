@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from irlcli.errors import IntegrityError
+from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.interventions import Setting
 from irlcli.trajectories import Trajectory
 
@@ -159,10 +159,7 @@ def read_metadata(directory: Path) -> dict[str, Any]:
             "demonstrations come from `irl collect-experts`",
         ) from None
     if version > SCHEMA:
-        raise IntegrityError(
-            f"{path} has schema {version}, newer than the {SCHEMA} known here",
-            "it was written by a newer irlcli: upgrade this one",
-        )
+        raise NewerFormat(str(path), version, SCHEMA)
     return tags
 
 

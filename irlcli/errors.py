@@ -44,6 +44,16 @@ class IntegrityError(IrlError):
     exit_code = 4
 
 
+class NewerFormat(IntegrityError):
+    """Sound bytes in a form that only a newer version of this program knows (exit 4)."""
+
+    def __init__(self, what: str, found: object, known: int):
+        super().__init__(
+            f"{what} has schema {found}, newer than the {known} known here",
+            "it was written by a newer irlcli: upgrade this one",
+        )
+
+
 class Busy(IrlError):
     """Another process holds what this one needs; trying again later will work (exit 75)."""
 

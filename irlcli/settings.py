@@ -18,10 +18,14 @@ from irlcli.interventions import environment, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
 
-Count = Annotated[int, Meta(ge=1)]
-NonNegativeCount = Annotated[int, Meta(ge=0)]
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
+# Bounded, so that every count fits 64 bits and no key holds an infinity or NaN.
+_MOST = 2**53
+_LARGE = 1e300
+Count = Annotated[int, Meta(ge=1, le=_MOST)]
+NonNegativeCount = Annotated[int, Meta(ge=0, le=_MOST)]
+Positive = Annotated[float, Meta(gt=0, le=_LARGE)]
+NonNegative = Annotated[float, Meta(ge=0, le=_LARGE)]
+Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 # gamma = 1 would make the value of an absorbing state infinite.
 Discount = Annotated[float, Meta(ge=0, lt=1)]
@@ -37,7 +41,7 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     n_envs: Count = 16
     n_steps: Count = 1024
     rollouts_per_round: Count = 1
-    batch_size: Annotated[int, Meta(ge=2)] = 512
+    batch_size: Annotated[int, Meta(ge=2, le=_MOST)] = 512
     n_epochs: Count = 4
     learning_rate: Positive = 1e-3
     learning_rate_schedule: Schedule = "constant"
@@ -72,7 +76,7 @@ class ExpertSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A policy trained on the true reward. ``bar`` is the mean true return that it must reach."""
 
     total_steps: Count = 1_000_000
-    bar: float | None = None
+    bar: Finite | None = None
     ppo: PPOSettings = PPOSettings()
 
 
@@ -95,7 +99,7 @@ class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     weight_decay: NonNegative = 1e-4
     max_grad_norm: Positive = 1.0
     updates_per_round: Count = 10
-    batch_size: Annotated[int, Meta(ge=2, multiple_of=2)] = 256
+    batch_size: Annotated[int, Meta(ge=2, le=_MOST, multiple_of=2)] = 256
     replay_share: Fraction = 0.5
     replay_per_round: Count = 1000
     replay_capacity: Count = 50_000
@@ -170,24 +174,25 @@ def load_settings(
         for dotted, value in (flags or {}).items()
         if value is not None
     ]
-    settings = _stack(layers)
-    for knob, values in settings.interventions.items():
-        for value in (*values.id, *values.ood):
-            parse_settings(env, f"{knob}={value}")
-    return settings
+    return _stack(env, layers)
 
 
-def _stack(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Settings:
+def _stack(env: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Settings:
     """The settings that ``layers`` of (source, values) lead to, later ones winning."""
     tree: dict[str, Any] = {}
     for _, values in layers:
         tree = _merge(tree, values)
     try:
-        return _convert(tree, "settings")
+        return _convert(env, tree)
     except UsageError:
-        # Alone, the layer at fault fails too, and the error names it.
+        # The layer with which it first fails is the one to name.
+        tree = {}
         for source, values in layers:
-            _convert(values, source)
+            tree = _merge(tree, values)
+            try:
+                _convert(env, tree)
+            except UsageError as error:
+                raise UsageError(f"{source}: {error.message}", error.hint) from None
         raise
 
 
@@ -200,7 +205,7 @@ def _settings_directory() -> Path:
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(
             f"{path} is not valid TOML: {error}", "see settings/ for examples"
         ) from None
@@ -224,17 +229,21 @@ def _nest(path: Sequence[str], value: Any) -> dict[str, Any]:
     return value
 
 
-def _convert(tree: Mapping[str, Any], source: str) -> Settings:
-    _check_names(tree, Settings, (), source)
+def _convert(env: str, tree: Mapping[str, Any]) -> Settings:
+    _check_names(tree, Settings, ())
     try:
-        return msgspec.convert(tree, Settings)
+        settings = msgspec.convert(tree, Settings)
     except msgspec.ValidationError as error:
         message, _, where = str(error).partition(" - at ")
         field = where.strip("`").removeprefix("$.")
-        raise UsageError(f"{source}: {field}: {message}", _field_hint(field)) from None
+        raise UsageError(f"{field}: {message}", _field_hint(field)) from None
+    for knob, values in settings.interventions.items():
+        for value in (*values.id, *values.ood):
+            parse_settings(env, f"{knob}={value}")
+    return settings
 
 
-def _check_names(tree: Any, kind: type, path: tuple[str, ...], source: str) -> None:
+def _check_names(tree: Any, kind: type, path: tuple[str, ...]) -> None:
     """Refuse unknown names here: msgspec names them without a suggestion."""
     if not isinstance(tree, Mapping):
         return
@@ -242,10 +251,10 @@ def _check_names(tree: Any, kind: type, path: tuple[str, ...], source: str) -> N
     for name, value in tree.items():
         if name not in fields:
             where = ".".join((*path, str(name)))
-            raise UsageError(f"{source}: no setting {where!r}", suggest(str(name), fields))
+            raise UsageError(f"no setting {where!r}", suggest(str(name), fields))
         inner = fields[name]
         if isinstance(inner, type) and issubclass(inner, Struct):
-            _check_names(value, inner, (*path, name), source)
+            _check_names(value, inner, (*path, name))
 
 
 def _override(item: str) -> dict[str, Any]:
@@ -256,7 +265,10 @@ def _override(item: str) -> dict[str, Any]:
     kind: Any = Settings
     for i, name in enumerate(path):
         if not (isinstance(kind, type) and issubclass(kind, Struct)):
-            raise UsageError(f"--set {item!r}: {'.'.join(path[:i])} has no fields")
+            parent = ".".join(path[:i])
+            raise UsageError(
+                f"--set {item!r}: {parent} has no fields", f"write --set {parent}=VALUE"
+            )
         fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
         if name not in fields:
             raise UsageError(
@@ -276,7 +288,7 @@ def _override(item: str) -> dict[str, Any]:
 def _typed(text: str, kind: Any, field: str) -> Any:
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         value = text
     try:
         return msgspec.to_builtins(msgspec.convert(value, kind))

@@ -19,7 +19,7 @@ MDPs that nobody demonstrates in.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
@@ -222,7 +222,7 @@ class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
         ValueError: as :func:`gridworld`.
     """
 
-    metadata = {"render_modes": ["ansi"], "render_fps": 4}
+    metadata: ClassVar = {"render_modes": ["ansi"], "render_fps": 4}
 
     def __init__(
         self,

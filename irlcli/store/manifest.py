@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from irlcli.errors import IntegrityError
+from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.store.digest import canonical_json, digest, file_digest
 
 SCHEMA = 1
@@ -21,6 +21,9 @@ PROVENANCE = "provenance.json"
 _SHA = r"[0-9a-f]{64}"
 # Far above any real one; a larger file is an attack or an accident, and is not parsed.
 _MAX_JSON_BYTES = 16 << 20
+# What every file system allows, so that checking a path never fails for its length.
+_MAX_PATH_BYTES = 200
+_HINT = "is this irlcli's file, and whole? `irl verify` checks a store"
 
 
 class KeyRecord(NamedTuple):
@@ -114,44 +117,43 @@ def read_json(path: Path) -> Any:
     """
     try:
         if path.is_symlink() or not path.is_file():
-            raise IntegrityError(f"{path} is missing or not a regular file")
+            raise IntegrityError(f"{path} is missing or not a regular file", _HINT)
         if path.stat().st_size > _MAX_JSON_BYTES:
-            raise IntegrityError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB")
+            raise IntegrityError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB", _HINT)
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
-        raise IntegrityError(f"{path} is not valid JSON ({error})") from None
+        raise IntegrityError(f"{path} is not valid JSON ({error})", _HINT) from None
     except OSError as error:
-        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})", _HINT) from None
 
 
 def read_manifest(directory: Path) -> Manifest:
     """The manifest of the artefact in ``directory``, every field checked.
 
     Raises:
-        IntegrityError: unreadable, malformed, or of a newer schema.
+        IntegrityError: unreadable, malformed, or altered in any byte.
+        NewerFormat: of a newer schema.
     """
     path = directory / MANIFEST
     value = read_json(path)
-    if (
-        isinstance(value, dict)
-        and isinstance(value.get("schema"), int)
-        and value["schema"] > SCHEMA
-    ):
-        raise IntegrityError(
-            f"{path} has schema {value['schema']}, newer than the {SCHEMA} known here",
-            "it was written by a newer irlcli: upgrade this one",
-        )
+    schema = value.get("schema") if isinstance(value, dict) else None
+    if type(schema) is int and schema > SCHEMA:
+        raise NewerFormat(str(path), schema, SCHEMA)
     try:
-        return _parse_manifest(value)
-    except (KeyError, TypeError, ValueError) as error:
-        raise IntegrityError(f"{path} is malformed ({error})") from None
+        manifest = _parse_manifest(value)
+        canonical = manifest.encode() == path.read_bytes()
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise IntegrityError(f"{path} is malformed ({error})", _HINT) from None
+    if not canonical:
+        raise IntegrityError(f"{path} was altered: it says the same in other bytes", _HINT)
+    return manifest
 
 
 def _parse_manifest(value: Any) -> Manifest:
     expected = {"schema", "stage", "stage_version", "parameters", "inputs", "outputs"}
     if not isinstance(value, dict) or set(value) != expected:
         raise ValueError(f"its keys are not {', '.join(sorted(expected))}")
-    if value["schema"] != SCHEMA:
+    if type(value["schema"]) is not int or value["schema"] != SCHEMA:
         raise ValueError(f"schema {value['schema']!r} is unknown")
     if not isinstance(value["stage"], str) or type(value["stage_version"]) is not int:
         raise ValueError("stage or stage_version has the wrong type")
@@ -161,6 +163,8 @@ def _parse_manifest(value: Any) -> Manifest:
         if not isinstance(sha, str) or not re.fullmatch(_SHA, sha):
             raise ValueError(f"input {role!r} is no sha256")
     outputs = []
+    if not isinstance(value["outputs"], list):
+        raise ValueError("outputs is no list")
     for item in value["outputs"]:
         if set(item) != {"path", "size", "sha256"}:
             raise ValueError("an output has other keys than path, size, sha256")
@@ -180,10 +184,13 @@ def check_output_path(path: Any) -> str:
     """``path`` if it stays inside an artefact and names none of its own two files.
 
     Raises:
-        ValueError: empty, absolute, with ``..``, a backslash or a NUL, or reserved.
+        ValueError: empty, absolute, too long, with ``..``, a backslash or unprintable
+            characters, or reserved.
     """
     if not isinstance(path, str) or not path or "\\" in path or "\0" in path:
         raise ValueError(f"output path {path!r} is not allowed")
+    if len(path.encode("utf-8", "replace")) > _MAX_PATH_BYTES or not path.isprintable():
+        raise ValueError(f"output path {path[:40]!r} is too long or holds unprintable characters")
     parts = PurePosixPath(path).parts
     if path.startswith("/") or ".." in parts or "/".join(parts) != path:
         raise ValueError(f"output path {path!r} is not allowed")
@@ -208,10 +215,13 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
     path = directory / PROVENANCE
     value = read_json(path)
     if not isinstance(value, dict) or not isinstance(value.get("record"), dict):
-        raise IntegrityError(f"{path} is malformed")
-    body = {name: item for name, item in value.items() if name != "sha256"}
-    if value.get("sha256") != digest(body):
-        raise IntegrityError(f"{path} was altered: its checksum does not match")
-    if value.get("artefact") != artefact_id:
-        raise IntegrityError(f"{path} belongs to another artefact")
+        raise IntegrityError(f"{path} is malformed", _HINT)
+    try:
+        sound = path.read_bytes() == encode_provenance(value["artefact"], value["record"])
+    except (KeyError, TypeError, ValueError, RecursionError):
+        sound = False
+    if not sound:
+        raise IntegrityError(f"{path} was altered: its checksum does not match", _HINT)
+    if value["artefact"] != artefact_id:
+        raise IntegrityError(f"{path} belongs to another artefact", _HINT)
     return value["record"]

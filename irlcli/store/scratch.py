@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import uuid
+from contextlib import suppress
 from pathlib import Path
 
 CHECKPOINT = "checkpoint"
@@ -69,10 +70,29 @@ class Scratch:
         (self.directory / CHECKPOINT).unlink(missing_ok=True)
 
     def new_output(self) -> Path:
-        """An empty directory for one attempt's outputs; those of dead attempts are removed."""
+        """An empty directory for one attempt's outputs; those of dead processes are removed."""
         self.directory.mkdir(exist_ok=True)
+        node = os.uname().nodename
         for stale in self.directory.glob("out.*"):
-            shutil.rmtree(stale)
-        path = self.directory / f"out.{uuid.uuid4().hex}"
+            _, pid, _, *owner = stale.name.split(".", 3)
+            if owner == [node] and not _alive(int(pid)):
+                shutil.rmtree(stale)
+        path = self.directory / f"out.{os.getpid()}.{uuid.uuid4().hex}.{node}"
         path.mkdir()
         return path
+
+    def clear(self) -> None:
+        """Forget the checkpoint; the directory goes too unless another process works in it."""
+        self.discard_checkpoint()
+        with suppress(OSError):
+            self.directory.rmdir()
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from irlcli.errors import IntegrityError, NotFound, UsageError, suggest
+from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError, suggest
 from irlcli.store.digest import file_digest
 from irlcli.store.lock import is_locked, locked
 from irlcli.store.manifest import (
@@ -44,6 +44,7 @@ from irlcli.store.manifest import (
 from irlcli.store.scratch import Scratch, fsync_directory, write_durably
 
 FORMAT = 1
+_OWN = (".keys", ".names", ".work", ".locks", ".quarantine")
 _ID_DIGITS = 16
 _ID = rf"[0-9a-f]{{{_ID_DIGITS}}}"
 _KEY = r"[0-9a-f]{64}"
@@ -127,15 +128,17 @@ class Store:
         if marker.exists():
             value = read_json(marker)
             version = value.get("format") if isinstance(value, dict) else None
-            if not isinstance(version, int) or version < 1:
+            if type(version) is not int or version < 1:
                 raise IntegrityError(f"{marker} names no format", "is this an irlcli store?")
             if version > FORMAT:
                 raise IntegrityError(
                     f"{self.root} is a store of format {version}, newer than the {FORMAT} known here",
                     "it was made by a newer irlcli: upgrade this one, or name another --store",
                 )
-        elif self.root.exists() and any(not p.name.startswith(".") for p in self.root.iterdir()):
-            # Hidden directories alone may be a store whose creation was cut short.
+        elif self.root.exists() and any(
+            p.name not in _OWN and not p.name.startswith(".STORE.") for p in self.root.iterdir()
+        ):
+            # Our own directories alone are a store whose creation was cut short.
             raise IntegrityError(
                 f"{self.root} has files in it but is no store",
                 "name an empty or a new directory with --store",
@@ -207,9 +210,9 @@ class Store:
         directory = self.root / id16
         try:
             manifest = read_manifest(directory)
+        except NewerFormat:
+            raise
         except IntegrityError as error:
-            if "newer" in error.message:
-                raise
             raise self._damaged(directory, error.message) from None
         if manifest.id[:_ID_DIGITS] != id16:
             raise self._damaged(directory, "its manifest does not match its address")
@@ -245,7 +248,9 @@ class Store:
     def names(self) -> dict[str, str]:
         """Name to id, sorted by name."""
         try:
-            entries = sorted(p for p in self._names().iterdir() if re.fullmatch(_NAME, p.name))
+            entries = sorted(
+                p for p in self._names().iterdir() if re.fullmatch(_NAME, p.name) and p.is_file()
+            )
         except FileNotFoundError:
             return {}
         found = {entry.name: entry.read_text("utf-8", "replace").strip() for entry in entries}
@@ -373,7 +378,7 @@ class Store:
             fsync_directory(directory)
         artefact = self._place(output, manifest)
         holder = self._claim(record.key, artefact)
-        shutil.rmtree(self._work() / record.key, ignore_errors=True)
+        Scratch(self._work() / record.key).clear()
         return Published(artefact, None if holder.id == artefact.id else holder)
 
     def _place(self, output: Path, manifest: Manifest) -> Artefact:
@@ -417,10 +422,15 @@ class Store:
         """What is wrong with the artefact ``id16``; empty if nothing. Moves nothing.
 
         ``quick`` compares sizes instead of hashing the outputs.
+
+        Raises:
+            NewerFormat: a newer version made it; nothing can be said of it.
         """
         directory = self.root / id16
         try:
             manifest = read_manifest(directory)
+        except NewerFormat:
+            raise
         except IntegrityError as error:
             return [error.message]
         if manifest.id[:_ID_DIGITS] != id16:
@@ -446,11 +456,16 @@ class Store:
         """Check artefacts; the damaged ones are moved to quarantine. Returns these."""
         damaged = {}
         for id16 in ids:
-            problems = self.problems(id16, quick)
-            if problems:
+            try:
+                problems = self.problems(id16, quick)
+            except NewerFormat as error:
+                # Not for this version to judge, nor to move.
+                damaged[id16] = Damage([error.message], "")
+                continue
+            # Another process may have collected it, or moved it to quarantine, meanwhile.
+            if problems and (self.root / id16).is_dir():
                 damaged[id16] = Damage(problems, _recorded_command(self.root / id16))
-                if not any("newer" in p for p in problems):
-                    self._move_to_quarantine(self.root / id16)
+                self._move_to_quarantine(self.root / id16)
         return damaged
 
     def _damaged(self, directory: Path, problem: str) -> IntegrityError:
@@ -534,12 +549,15 @@ class Store:
         Raises:
             Busy: the store is in use.
         """
+        if not self._locks().is_dir():
+            return [], []
         with locked(self._locks() / "gc"):
             artefacts, work = self.garbage(grace_seconds), self.stale_work(grace_seconds)
             for artefact in artefacts:
                 for pointer in _pointers_to(self._keys(), artefact.id):
                     pointer.unlink(missing_ok=True)
-                grave = self._work() / f"removed-{artefact.id}"
+                # A name of its own: a crash may have left an earlier one half removed.
+                grave = self._work() / f"removed-{artefact.id}-{uuid.uuid4().hex[:8]}"
                 artefact.directory.chmod(0o755)
                 artefact.directory.rename(grave)
                 shutil.rmtree(grave)
@@ -564,7 +582,9 @@ def _pointers_to(keys: Path, id16: str) -> list[Path]:
     return [
         path
         for path in keys.iterdir()
-        if re.fullmatch(_KEY, path.name) and path.read_bytes().strip() == id16.encode()
+        if re.fullmatch(_KEY, path.name)
+        and path.is_file()
+        and path.read_bytes().strip() == id16.encode()
     ]
 
 

@@ -1,0 +1,142 @@
+"""Fixtures shared by all tests: a store made by the real chain, and the real command line."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import io
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from irlcli import cli as command_line
+from irlcli.store import KeyRecord, Published, Store
+
+
+@dataclass(frozen=True)
+class SmokeStore:
+    """A store with one chain in it. Shared by the whole session: copy it before changing it.
+
+    The fields but ``path`` are ids; the first four are also named ``demos``, ``airl``, ``moved``
+    and ``score`` in the store.
+    """
+
+    path: Path
+    demos: str
+    airl: str
+    transfer: str
+    evaluation: str
+    expert: str  # of engine-power=1x
+
+
+class Result(NamedTuple):
+    """What a command line led to."""
+
+    code: int
+    out: str
+    err: str
+
+
+def run_main(arguments: list[str]) -> Result:
+    """``irl ARGUMENTS`` in this process, through the real entry point."""
+    out, err = io.StringIO(), io.StringIO()
+    before, code = sys.argv, 0
+    sys.argv = ["irl", *arguments]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            command_line.main()
+    except SystemExit as stop:
+        code = stop.code or 0
+    finally:
+        sys.argv = before
+    return Result(code, out.getvalue(), err.getvalue())
+
+
+@pytest.fixture(scope="session")
+def smoke_store(tmp_path_factory: pytest.TempPathFactory) -> SmokeStore:
+    """collect-experts, train-airl (irm), transfer and evaluate with ``--profile smoke``."""
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent  # the workers of one run share it: the first one builds for all
+    ready, store = base / "smoke.json", base / "smoke-store"
+    with open(base / "smoke.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not ready.exists():
+            ready.write_text(json.dumps(_build_chain(store)))
+    return SmokeStore(store, **json.loads(ready.read_text()))
+
+
+def _build_chain(store: Path) -> dict[str, str]:
+    ids: dict[str, str] = {}
+    lander = ["--env", "lunar-lander", "--intervention", "engine-power=1x,1.25x"]
+    for field, name, arguments in (
+        ("demos", "demos", ["collect-experts", *lander]),
+        ("airl", "airl", ["train-airl", "--demos", "demos", "--method", "irm"]),
+        ("transfer", "moved", ["transfer", "--reward", "airl/reward.pt", "--ood", "1.5x"]),
+        ("evaluation", "score", ["evaluate", "--policy", "moved", "--ood", "1.5x"]),
+    ):
+        common = ["--store", str(store), "--profile", "smoke", "--quiet", "--name", name]
+        done = run_main([*arguments, *common])
+        assert done.code == 0, done.err
+        ids[field] = Path(done.out.strip()).name
+    demos = Store(store).get(ids["demos"])
+    (expert,) = Store(store).ancestors(demos)["expert engine-power=1x"]
+    return {**ids, "expert": expert.id}
+
+
+@pytest.fixture
+def store_copy(smoke_store: SmokeStore, tmp_path: Path) -> SmokeStore:
+    """A copy of the smoke store that a test may change."""
+    path = tmp_path / "runs"
+    shutil.copytree(smoke_store.path, path, symlinks=True)
+    return SmokeStore(**{**asdict(smoke_store), "path": path})
+
+
+@pytest.fixture
+def irl(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    """``irl("ls", "--store", path)`` in this process, through the real entry point."""
+    monkeypatch.delenv("IRL_STORE", raising=False)
+    return lambda *arguments: run_main([str(a) for a in arguments])
+
+
+@pytest.fixture
+def empty_store(tmp_path: Path) -> Store:
+    """A new store without artefacts."""
+    store = Store(tmp_path / "runs")
+    store.create()
+    return store
+
+
+SMALL_FILES = {"reward.pt": bytes(range(256)) * 8, "nested/table.parquet": b"PAR1" * 100}
+
+
+def publish_files(
+    store: Store,
+    files: Mapping[str, bytes] = SMALL_FILES,
+    *,
+    stage: str = "train-airl",
+    parameters: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, str] | None = None,
+) -> Published:
+    """Publish ``files`` as a stage would, without the cost of running one."""
+    record = KeyRecord(stage, 1, dict(parameters or {"seed": 0}), dict(inputs or {}))
+    store.create()
+    with store.in_use(), store.working_on(record.key, wait=False) as scratch:
+        output = scratch.new_output()
+        for name, data in files.items():
+            (output / name).parent.mkdir(parents=True, exist_ok=True)
+            (output / name).write_bytes(data)
+        return store.publish(record, output, {"command": ["irl", stage]})
+
+
+@pytest.fixture
+def publish() -> Callable[..., Published]:
+    """:func:`publish_files`."""
+    return publish_files

@@ -1,0 +1,418 @@
+"""Publishing: whole or absent, whatever happens in the middle.
+
+The protocol is attacked at the calls it makes of the operating system: each one that changes the
+file system is numbered, and the process is killed, or the call fails, at every number in turn.
+"""
+
+# ruff: noqa: B023 (the closures over a loop's variables run within their own iteration)
+
+from __future__ import annotations
+
+import builtins
+import errno
+import io
+import os
+import signal
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from irlcli.store import KeyRecord, Published, Store
+
+FILES = {"reward.pt": bytes(range(256)) * 4, "nested/table.parquet": b"PAR1" * 64}
+RECORD = KeyRecord("train-airl", 1, {"seed": 0, "rate": 1e-5}, {"demonstrations": "0" * 64})
+_OS_CALLS = ("fsync", "rename", "replace", "link", "chmod", "unlink", "rmdir", "mkdir", "open")
+_SITES = [(os, name) for name in _OS_CALLS] + [(builtins, "open"), (io, "open")]
+_ENOUGH = 300  # far more calls than one publish makes
+
+
+def attempt(
+    store: Store, files: dict[str, bytes] = FILES, attempt_name: str = "out.0"
+) -> Published:
+    """One publisher, without the lock: correctness must not depend on it."""
+    output = stage_output(store, files, attempt_name)
+    return store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
+
+
+def stage_output(store: Store, files: dict[str, bytes], attempt_name: str) -> Path:
+    """What a stage leaves in its output directory."""
+    output = store.root / ".work" / RECORD.key / attempt_name
+    for name, data in files.items():
+        (output / name).parent.mkdir(parents=True, exist_ok=True)
+        (output / name).write_bytes(data)
+    return output
+
+
+class Torn:
+    """A file whose writes can be interrupted half way."""
+
+    def __init__(self, file: Any, at_call: Callable[..., None]):
+        self._file, self._at_call = file, at_call
+
+    def write(self, data: Any) -> int:
+        def half() -> None:
+            self._file.write(data[: len(data) // 2])
+            self._file.flush()
+
+        self._at_call("write", (), half)
+        return self._file.write(data)
+
+    def __enter__(self) -> Torn:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def intercept(put: Callable[[Any, str, Any], None], at_call: Callable[..., None]) -> None:
+    """Announce every call that can change the file system to ``at_call(name, args, half)``."""
+
+    def wrapped(original: Callable, name: str) -> Callable:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            at_call(name, args, lambda: None)
+            result = original(*args, **kwargs)
+            writable = isinstance(result, io.IOBase) and result.writable()
+            return Torn(result, at_call) if writable else result
+
+        return call
+
+    for module, name in _SITES:
+        put(module, name, wrapped(getattr(module, name), name))
+
+
+def counter(limit: int, act: Callable[[Callable[[], None]], None], persist: bool = False):
+    """An ``at_call`` that lets ``limit`` calls pass, then acts (once, or from then on)."""
+    seen = 0
+
+    def at_call(name: str, args: tuple, half: Callable[[], None]) -> None:
+        nonlocal seen
+        seen += 1
+        if seen == limit + 1 or (persist and seen > limit):
+            act(half)
+
+    return at_call
+
+
+def assert_whole_or_absent(store: Store) -> None:
+    """Nothing half-published: what readers can see is complete and unaltered."""
+    assert store.verify(store.ids()) == {}
+    found = store.find(RECORD.key)
+    if found is not None:
+        for name, data in FILES.items():
+            assert store.open(found, name).read_bytes() == data
+        assert found.provenance()["command"] == ["irl", "train-airl"]
+    for id16 in store.names().values():
+        assert id16 in store.ids()
+
+
+def assert_publishes_again(store: Store, expected: str) -> None:
+    again = attempt(store, attempt_name="out.again")
+    assert (again.artefact.id, again.diverged) == (expected, None)
+    found = store.find(RECORD.key)
+    assert found is not None and found.id == expected
+    assert store.ids() == [expected]
+    assert store.verify([expected]) == {}
+    assert list((store.root / ".quarantine").iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def expected_id(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return attempt(Store(_created(tmp_path_factory.mktemp("clean")))).artefact.id
+
+
+def _created(root: Path) -> Path:
+    Store(root).create()
+    return root
+
+
+def new_stores(tmp_path: Path) -> Iterator[tuple[int, Store]]:
+    for n in range(_ENOUGH):
+        yield n, Store(_created(tmp_path / str(n)))
+    pytest.fail("publishing never completed")
+
+
+def in_child(work: Callable[[], None]) -> int:
+    """The wait status of a forked child that does ``work`` (99 if it raises)."""
+    pid = os.fork()
+    if pid == 0:
+        code = 99
+        try:
+            work()
+            code = 0
+        finally:
+            os._exit(code)
+    return os.waitpid(pid, 0)[1]
+
+
+def kill_self(half: Callable[[], None]) -> None:
+    half()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_sigkill_at_every_step_of_publish(tmp_path, expected_id):
+    for n, store in new_stores(tmp_path):
+
+        def work() -> None:
+            output = stage_output(store, FILES, "out.0")
+            intercept(setattr, counter(n, kill_self))
+            store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
+
+        status = in_child(work)
+        assert_whole_or_absent(Store(store.root))
+        assert_publishes_again(Store(store.root), expected_id)
+        if os.WIFEXITED(status):
+            assert os.WEXITSTATUS(status) == 0
+            break
+        assert os.WTERMSIG(status) == signal.SIGKILL
+    assert n > 25  # each file and directory is made durable: fewer calls were not intercepted
+
+
+def test_sigkill_at_every_step_of_create(tmp_path):
+    for n in range(_ENOUGH):
+        root = tmp_path / str(n)
+
+        def work() -> None:
+            store = Store(root)
+            intercept(setattr, counter(n, kill_self))
+            store.create()
+
+        status = in_child(work)
+        Store(root).create()  # a store that a crash left half made is one that can be finished
+        assert attempt(Store(root)).artefact.id in Store(root).ids()
+        if os.WIFEXITED(status):
+            assert os.WEXITSTATUS(status) == 0
+            break
+    assert n >= 6
+
+
+def test_sigkill_at_every_step_of_naming(tmp_path):
+    """A name is the old one or the new one, and never makes the others unreadable."""
+    store = Store(_created(tmp_path / "runs"))
+    old = attempt(store).artefact
+    new = store.publish(
+        RECORD._replace(stage_version=2), stage_output(store, FILES, "out.1"), {}
+    ).artefact
+    for n in range(_ENOUGH):
+        store.set_name("best", old)
+
+        def work() -> None:
+            intercept(setattr, counter(n, kill_self))
+            store.set_name("best", new)
+
+        status = in_child(work)
+        names = Store(store.root).names()
+        assert set(names) == {"best"} and names["best"] in (old.id, new.id)
+        if os.WIFEXITED(status):
+            assert names["best"] == new.id
+            break
+    assert n >= 3
+
+
+@pytest.mark.parametrize("persist", [False, True], ids=["once", "from-then-on"])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_failing_call_at_every_step_of_publish(tmp_path, expected_id, number, persist):
+    """A full disk, a file system that turned read-only, a failing device."""
+
+    def fail(half: Callable[[], None]) -> None:
+        half()
+        raise OSError(number, os.strerror(number))
+
+    failures = 0
+    for n, store in new_stores(tmp_path):
+        output = stage_output(store, FILES, "out.0")
+        seen = 0
+
+        def count(name: str, args: tuple, half: Callable[[], None]) -> None:
+            nonlocal seen
+            seen += 1
+            at_call(name, args, half)
+
+        at_call = counter(n, fail, persist)
+        with pytest.MonkeyPatch.context() as patch:
+            intercept(patch.setattr, count)
+            try:
+                store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
+            except OSError as error:
+                assert error.errno == number
+                failures += 1
+        assert_whole_or_absent(Store(store.root))
+        assert_publishes_again(Store(store.root), expected_id)
+        if seen <= n:
+            break
+    assert failures > 20
+
+
+def test_durable_before_visible(tmp_path):
+    """Page cache survives SIGKILL but no power cut, so the order of the calls is the promise."""
+    store = Store(_created(tmp_path / "runs"))
+    output = stage_output(store, FILES, "out.0")
+    log: list[tuple[str, str]] = []
+
+    def record(name: str, args: tuple, half: Callable[[], None]) -> None:
+        if name == "fsync":
+            target = args[0] if isinstance(args[0], int) else args[0].fileno()
+            log.append((name, os.readlink(f"/proc/self/fd/{target}")))
+        elif name in ("rename", "link"):
+            log.append((name, str(args[1])))
+
+    with pytest.MonkeyPatch.context() as patch:
+        intercept(patch.setattr, record)
+        artefact = store.publish(RECORD, output, {}).artefact
+    appears = log.index(("rename", str(artefact.directory)))
+    claimed = log.index(("link", str(store.root / ".keys" / RECORD.key)))
+    durable = {path for call, path in log[:appears] if call == "fsync"}
+    for path in (output, output / "nested", *(output / name for name in FILES)):
+        assert str(path) in durable
+    # Manifest and provenance are written under a temporary name and synced there.
+    for name in ("manifest.json", "provenance.json"):
+        assert any(Path(p).name.startswith(f".{name}.") for p in durable)
+    assert ("fsync", str(store.root)) in log[appears:claimed]
+    assert ("fsync", str(store.root / ".keys")) in log[claimed:]
+
+
+def test_published_files_are_read_only_and_scratch_is_gone(tmp_path):
+    store = Store(_created(tmp_path / "runs"))
+    artefact = attempt(store).artefact
+    for path in artefact.directory.rglob("*"):
+        if path.is_file():
+            assert stat.S_IMODE(path.stat().st_mode) == 0o444, path
+    assert stat.S_IMODE(artefact.directory.stat().st_mode) == 0o555
+    assert list((store.root / ".work").iterdir()) == []
+    assert [p.name for p in (store.root / ".keys").iterdir()] == [RECORD.key]
+
+
+def test_find_before_and_after(tmp_path):
+    store = Store(tmp_path / "runs")
+    assert store.find(RECORD.key) is None  # a store that does not exist yet
+    assert not store.root.exists()
+    store.create()
+    assert store.find(RECORD.key) is None
+    artefact = attempt(store).artefact
+    assert store.find(RECORD.key) == artefact
+    assert store.find("0" * 64) is None
+    assert Store(store.root).get(artefact.id).manifest == artefact.manifest
+
+
+def test_equal_content_is_one_artefact(tmp_path):
+    store = Store(_created(tmp_path / "runs"))
+    first = attempt(store)
+    second = attempt(store, attempt_name="out.1")
+    assert first.artefact.id == second.artefact.id and second.diverged is None
+    assert store.ids() == [first.artefact.id]
+
+
+def test_id_depends_on_record_and_content_only(tmp_path):
+    """Not on the store, the provenance, or the order in which files were written."""
+    one, two = (Store(_created(tmp_path / name)) for name in ("one", "two"))
+    reverse = dict(reversed(FILES.items()))
+    first = attempt(one).artefact
+    second = two.publish(RECORD, stage_output(two, reverse, "out.0"), {"seconds": 3.5}).artefact
+    assert first.manifest == second.manifest
+    assert (first.directory / "manifest.json").read_bytes() == (
+        second.directory / "manifest.json"
+    ).read_bytes()
+    third = two.publish(RECORD._replace(stage_version=2), stage_output(two, FILES, "out.1"), {})
+    assert third.artefact.id != first.id
+    assert third.artefact.manifest.content == first.manifest.content
+
+
+def test_second_different_result_is_kept_and_reported(tmp_path):
+    store = Store(_created(tmp_path / "runs"))
+    first = attempt(store).artefact
+    second = attempt(store, {**FILES, "reward.pt": b"other"}, "out.1")
+    assert second.diverged == first
+    assert second.artefact.id != first.id
+    assert store.find(RECORD.key) == first  # the first writer wins
+    assert store.ids() == sorted([first.id, second.artefact.id])
+    assert store.verify(store.ids()) == {}
+
+
+def test_damaged_twin_is_replaced_not_trusted(tmp_path):
+    """Publishing over a damaged artefact of the same id must not keep the damaged bytes."""
+    store = Store(_created(tmp_path / "runs"))
+    artefact = attempt(store).artefact
+    path = artefact.directory / "reward.pt"
+    path.chmod(0o644)
+    path.write_bytes(b"x" * path.stat().st_size)
+    again = attempt(store, attempt_name="out.1").artefact
+    assert again.id == artefact.id
+    assert store.open(again, "reward.pt").read_bytes() == FILES["reward.pt"]
+    assert len(list((store.root / ".quarantine").iterdir())) == 1
+
+
+@pytest.mark.parametrize("kind", ["symlink", "fifo"])
+def test_outputs_that_are_no_files_are_refused(tmp_path, kind):
+    store = Store(_created(tmp_path / "runs"))
+    output = stage_output(store, FILES, "out.0")
+    if kind == "symlink":
+        (output / "extra").symlink_to("/etc/passwd")
+    else:
+        os.mkfifo(output / "extra")
+    with pytest.raises(ValueError, match="not a plain file"):
+        store.publish(RECORD, output, {})
+    assert store.ids() == [] and store.find(RECORD.key) is None
+
+
+@pytest.mark.parametrize("other", [FILES, {"reward.pt": b"other"}], ids=["equal", "different"])
+def test_two_publishers_interleaved_at_every_step(tmp_path, other):
+    """Locks only save work: where flock does nothing, two processes publish one key at once.
+
+    The second one publishes completely before the n-th call of the first.
+    """
+    for n, store in new_stores(tmp_path):
+        output = stage_output(store, FILES, "out.slow")
+        rival = stage_output(store, other, "out.fast")
+        calls, won = 0, None
+
+        def at_call(name: str, args: tuple, half: Callable[[], None]) -> None:
+            nonlocal calls, won
+            calls += 1
+            if calls == n + 1:
+                won = store.publish(RECORD, rival, {"command": ["irl", "train-airl"]})
+
+        with pytest.MonkeyPatch.context() as patch:
+            intercept(patch.setattr, at_call)
+            slow = store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
+        assert store.verify(store.ids()) == {}
+        if won is None:
+            break
+        # Whoever claimed the key first holds it, both know, and both results are there.
+        holder = store.find(RECORD.key)
+        assert holder is not None
+        assert holder in (slow.artefact, slow.diverged)
+        assert holder in (won.artefact, won.diverged)
+        assert {slow.artefact.id, won.artefact.id} == set(store.ids())
+    assert n > 25
+
+
+def test_many_processes_publish_at_once(tmp_path):
+    """Half of them with different bytes: one holder, nothing partial, nothing lost."""
+    store = Store(_created(tmp_path / "runs"))
+    children = []
+    for i in range(6):
+        pid = os.fork()
+        if pid == 0:
+            code = 99
+            try:
+                files = FILES if i % 2 else {**FILES, "reward.pt": b"other"}
+                with store.working_on(RECORD.key, wait=True) as scratch:
+                    output = scratch.new_output()
+                    for name, data in files.items():
+                        (output / name).parent.mkdir(exist_ok=True)
+                        (output / name).write_bytes(data)
+                    store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
+                code = 0
+            finally:
+                os._exit(code)
+        children.append(pid)
+    assert [os.waitpid(pid, 0)[1] for pid in children] == [0] * 6
+    assert len(store.ids()) == 2
+    assert store.verify(store.ids()) == {}
+    found = store.find(RECORD.key)
+    assert found is not None and found.id in store.ids()

@@ -1,0 +1,304 @@
+"""The intervention grammar: what is read, what it prints as, and how mistakes are answered."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from irlcli.errors import IrlError, UsageError
+from irlcli.interventions import (
+    ENVIRONMENTS,
+    Environment,
+    Knob,
+    Setting,
+    Value,
+    env_kwargs,
+    environment,
+    knob_of,
+    parse_setting,
+    parse_settings,
+    parse_value,
+)
+
+LANDER = "lunar-lander"
+WORLD = "test-world"
+_FORMS = {
+    "double": Knob("double", ("multiplier",), -1e300, 1e300, "1x", "a multiplier"),
+    "plain": Knob("plain", ("absolute",), -1e300, 1e300, "0", "an absolute value"),
+    "three": Knob("three", ("triple",), -1e300, 1e300, "0:0:0", "a triple"),
+    "span": Knob("span", ("range",), -1e300, 1e300, "0..0", "a range"),
+    "mixed": Knob("mixed", ("multiplier", "absolute"), 0.0, 10.0, "1x", "two forms"),
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def world():
+    """An environment with a knob of every form, so that the whole grammar can be tried."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ENVIRONMENTS, WORLD, Environment(WORLD, "test/World-v0", 10, _FORMS))
+        yield
+
+
+@pytest.mark.parametrize(
+    ("knob", "text", "kind", "numbers", "printed"),
+    [
+        ("double", "2x", "multiplier", (2.0,), "2x"),
+        ("double", "1.25x", "multiplier", (1.25,), "1.25x"),
+        ("double", "+2.0x", "multiplier", (2.0,), "2x"),
+        ("double", "2.x", "multiplier", (2.0,), "2x"),
+        ("double", ".5x", "multiplier", (0.5,), "0.5x"),
+        ("double", "1e-3x", "multiplier", (0.001,), "0.001x"),
+        ("double", "1E2x", "multiplier", (100.0,), "100x"),
+        ("double", " 2x ", "multiplier", (2.0,), "2x"),
+        ("double", "-0x", "multiplier", (0.0,), "0x"),
+        ("plain", "0.5", "absolute", (0.5,), "0.5"),
+        ("plain", "-900", "absolute", (-900.0,), "-900"),
+        ("plain", "007", "absolute", (7.0,), "7"),
+        ("plain", "0.1", "absolute", (0.1,), "0.1"),
+        ("plain", "1e-320", "absolute", (1e-320,), "1e-320"),
+        (
+            "plain",
+            "123456789012345678",
+            "absolute",
+            (1.2345678901234568e17,),
+            "1.2345678901234568e+17",
+        ),
+        ("three", "1.5:0.1:0.1", "triple", (1.5, 0.1, 0.1), "1.5:0.1:0.1"),
+        ("three", "2:0:-0.0", "triple", (2.0, 0.0, 0.0), "2:0:0"),
+        ("span", "-10..0", "range", (-10.0, 0.0), "-10..0"),
+        ("span", "0.5..1.5", "range", (0.5, 1.5), "0.5..1.5"),
+        ("span", "3..3", "range", (3.0, 3.0), "3..3"),
+        ("mixed", "0.5", "absolute", (0.5,), "0.5"),
+        ("mixed", "0.5x", "multiplier", (0.5,), "0.5x"),
+    ],
+)
+def test_values(knob, text, kind, numbers, printed):
+    value = parse_value(WORLD, knob, text)
+    assert value == Value(kind, numbers)
+    assert str(value) == printed
+    assert all(math.copysign(1, x) > 0 for x in value.numbers if x == 0)  # no negative zero
+
+
+@pytest.mark.parametrize("kind", ["double", "plain", "three", "span"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        " ",
+        "x",
+        "abc",
+        "1,5",
+        "1 5",
+        "0x10",
+        "1_000",
+        "--1",
+        "+-1",
+        "1e",
+        "e5",
+        ".",
+        "nan",
+        "inf",
+        "-inf",
+        "1:2",
+        "1:2:3:4",
+        "1:2:",
+        "1..",
+        "..1",
+        "1..2..3",
+        "2xx",
+        "x2",
+        "2X",
+        "1x:2x:3x",
+        "½",
+        "1\n2",
+        "1;2",
+        "1x2",
+        "None",
+        "True",
+        "[1]",
+        "1j",
+        "９x9",
+        "\0",
+    ],
+)
+def test_what_is_no_value_is_named_with_an_example(kind, text):
+    with pytest.raises(UsageError) as caught:
+        parse_value(WORLD, kind, text)
+    assert repr(text.strip()) in caught.value.message
+    assert kind in caught.value.message
+    assert f"{kind}=" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("knob", "text"),
+    [("double", "2"), ("plain", "2x"), ("three", "2"), ("span", "-10"), ("mixed", "1:2:3")],
+)
+def test_the_wrong_form_is_named(knob, text):
+    with pytest.raises(UsageError) as caught:
+        parse_value(WORLD, knob, text)
+    assert " as " in caught.value.message and repr(text) in caught.value.message
+    for kind in _FORMS[knob].kinds:
+        assert kind in caught.value.message
+    assert "write it like" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("knob", "text"),
+    [
+        ("engine-power", "0x"),
+        ("engine-power", "-1x"),
+        ("engine-power", "0.01x"),
+        ("engine-power", "1000x"),
+        ("engine-power", "1e400x"),
+        ("bounce", "1.0000001"),
+        ("bounce", "-0.1"),
+        ("bounce", "-1e-300"),
+        ("friction", "11"),
+        ("friction", "1e308"),
+        ("friction", "-1"),
+        ("friction", "9" * 400),
+    ],
+)
+def test_absurd_values_are_refused_with_the_range(knob, text):
+    with pytest.raises(UsageError, match="out of range") as caught:
+        parse_value(LANDER, knob, text)
+    assert repr(text) in caught.value.message
+    assert " to " in caught.value.hint and knob in caught.value.hint
+
+
+@pytest.mark.parametrize("text", ["1e400", "-1e400"])
+@pytest.mark.parametrize("form", ["double={}x", "plain={}", "three=1:{}:1", "span=-1e400..1e400"])
+def test_numbers_beyond_floats_are_refused(form, text):
+    with pytest.raises(UsageError, match="out of range"):
+        parse_settings(WORLD, form.format(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "''"),
+        ("engine-power", "'engine-power'"),
+        ("engine-power=", "'engine-power='"),
+        ("=1x", "'=1x'"),
+        (" = ", "' = '"),
+        ("engine-power=1x,", "''"),
+        ("engine-power=,1x", "''"),
+        ("engine-power=1x,,2x", "''"),
+        ("engine-power=1x;2x", "'1x;2x'"),
+        ("engine-power==1x", "'=1x'"),
+        ("engine-power=1x=2x", "'1x=2x'"),
+        ("engine-power=1x,bounce=0.5", "'bounce=0.5'"),
+        ("engine-power=1x,1x", "engine-power=1x"),
+        ("engine-power=1x,1.0x", "engine-power=1x"),
+        ("bounce=0,-0", "bounce=0"),
+        ("engine_power=1x", "engine_power"),
+        ("ENGINE-POWER=1x", "ENGINE-POWER"),
+        ("leg-length=2x", "leg-length"),
+        ("engine-power=1", "'1'"),
+        ("bounce=0.5x", "'0.5x'"),
+    ],
+)
+def test_malformed_settings_name_the_thing_and_hint(text, named):
+    with pytest.raises(UsageError) as caught:
+        parse_settings(LANDER, text)
+    assert named in caught.value.message
+    assert caught.value.hint
+    assert "\n" not in caught.value.message + caught.value.hint
+
+
+def test_settings_keep_their_order():
+    settings = parse_settings(LANDER, " engine-power = 2x, 1x ,1.5x")
+    assert [str(s) for s in settings] == ["engine-power=2x", "engine-power=1x", "engine-power=1.5x"]
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"), [("lunar-landr", "lunar-lander"), ("lunarlander", "lunar-lander")]
+)
+def test_unknown_environment_is_suggested(name, meant):
+    for ask in (
+        environment,
+        lambda n: parse_settings(n, "bounce=1"),
+        lambda n: parse_setting(n, "default"),
+    ):
+        with pytest.raises(UsageError, match=name) as caught:
+            ask(name)
+        assert f"did you mean '{meant}'" in caught.value.hint
+
+
+def test_unknown_knob_is_suggested():
+    with pytest.raises(UsageError, match="engine-powr") as caught:
+        knob_of(LANDER, "engine-powr")
+    assert "did you mean 'engine-power'" in caught.value.hint
+
+
+def test_knob_of_another_environment_names_its_owner():
+    with pytest.raises(UsageError, match="'span'") as caught:
+        parse_settings(LANDER, "span=-1..1")
+    assert WORLD in caught.value.hint and "engine-power" in caught.value.hint
+
+
+def test_one_setting():
+    assert parse_setting(LANDER, "default") == Setting()
+    assert parse_setting(LANDER, "bounce=0.5") == Setting("bounce", Value("absolute", (0.5,)))
+    with pytest.raises(UsageError, match="2 settings where one") as caught:
+        parse_setting(LANDER, "bounce=0.1,0.5")
+    assert caught.value.hint
+
+
+def test_arguments_of_the_environment():
+    assert env_kwargs(LANDER, Setting()) == {}
+    assert env_kwargs(LANDER, parse_setting(LANDER, "engine-power=2x")) == {"engine_power": 2.0}
+    assert env_kwargs(WORLD, parse_setting(WORLD, "three=1:2:3")) == {"three": (1.0, 2.0, 3.0)}
+
+
+@pytest.mark.parametrize("env", sorted(ENVIRONMENTS))
+def test_every_knob_s_default_lies_in_its_own_range(env):
+    for name, knob in ENVIRONMENTS[env].knobs.items():
+        value = parse_value(env, name, knob.default)
+        assert value.kind in knob.kinds
+
+
+NUMBERS = st.floats(-1e300, 1e300)
+VALUES = {
+    "double": NUMBERS.map(lambda x: (x,)),
+    "plain": NUMBERS.map(lambda x: (x,)),
+    "three": st.tuples(NUMBERS, NUMBERS, NUMBERS),
+    "span": st.tuples(NUMBERS, NUMBERS).map(lambda pair: tuple(sorted(pair))),
+}
+
+
+@given(st.sampled_from(sorted(VALUES)).flatmap(lambda k: st.tuples(st.just(k), VALUES[k])))
+def test_what_is_printed_reads_back(case):
+    """Settings are stored in their printed form, so it must lose not a single bit."""
+    knob, numbers = case
+    value = Value(_FORMS[knob].kinds[0], tuple(x + 0.0 for x in numbers))
+    setting = Setting(knob, value)
+    assert parse_setting(WORLD, str(setting)) == setting
+    assert str(parse_setting(WORLD, str(setting))) == str(setting)
+
+
+GRAMMAR = st.text("0123456789.xe:+-,= \n", max_size=20)
+
+
+@given(knob=st.sampled_from(sorted(_FORMS)), text=GRAMMAR | st.text(max_size=12))
+def test_any_text_is_read_stably_or_refused_with_a_hint(knob, text):
+    try:
+        settings = parse_settings(WORLD, f"{knob}={text}")
+    except IrlError as error:
+        assert isinstance(error, UsageError) and error.hint
+        assert "\n" not in error.message
+        return
+    for setting in settings:
+        assert parse_setting(WORLD, str(setting)) == setting
+        assert all(math.isfinite(x) for x in setting.value.numbers)
+
+
+@given(env=st.text(max_size=10), text=st.text(max_size=20))
+def test_any_environment_and_text(env, text):
+    for ask in (parse_settings, parse_setting):
+        with pytest.raises(UsageError) as caught:
+            ask(env, text)
+        assert caught.value.hint

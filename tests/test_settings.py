@@ -1,0 +1,352 @@
+"""Settings: what wins over what, what is refused, and whether the message names its source."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from irlcli.errors import UsageError
+from irlcli.interventions import ENVIRONMENTS, parse_settings
+from irlcli.settings import PROFILES, Settings, load_settings
+from irlcli.store import canonical_json
+
+LANDER = "lunar-lander"
+SETTINGS = Path(__file__).parent.parent / "settings"
+
+
+@pytest.fixture
+def toml(tmp_path):
+    """A settings file with the given text."""
+
+    def write(text: str | bytes) -> Path:
+        path = tmp_path / "mine.toml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def refused(*args, **kwargs) -> UsageError:
+    """The error of loading these, checked for what every one of them owes the reader."""
+    with pytest.raises(UsageError) as caught:
+        load_settings(LANDER, *args, **kwargs)
+    assert caught.value.hint
+    assert "\n" not in caught.value.message
+    return caught.value
+
+
+# What is shipped
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("path", sorted(SETTINGS.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_shipped_profile_loads(path, profile):
+    settings = load_settings(path.stem, profile)
+    canonical_json(msgspec.to_builtins(settings))  # can be part of a key
+    for knob, values in settings.interventions.items():
+        trained, held_out = (
+            {s for v in side for s in parse_settings(path.stem, f"{knob}={v}")}
+            for side in (values.id, values.ood)
+        )
+        assert trained and held_out and not trained & held_out
+
+
+def test_every_environment_has_settings_and_the_reverse():
+    assert {p.stem for p in SETTINGS.glob("*.toml")} == set(ENVIRONMENTS)
+
+
+@pytest.mark.parametrize("path", sorted(SETTINGS.glob("*/*.toml")), ids=lambda p: p.parent.name)
+def test_every_shipped_overlay_loads(path):
+    assert load_settings(path.stem, "standard", path) != load_settings(path.stem, "standard")
+
+
+def test_profiles_differ_and_smoke_is_small():
+    smoke, standard, paper = (load_settings(LANDER, p) for p in PROFILES)
+    assert smoke.expert.total_steps < 10_000 < standard.expert.total_steps
+    assert paper.expert.ppo.batch_size == 64  # rl-baselines3-zoo
+    assert smoke != standard and standard != paper
+
+
+# Precedence
+
+
+def test_defaults_file_profile_settings_flags_and_set(toml):
+    """defaults < settings file < profile < --settings < flags and --set."""
+    assert Settings().expert.total_steps == 1_000_000
+    assert load_settings(LANDER).expert.total_steps == 2_000_000
+    assert load_settings(LANDER, "smoke").expert.total_steps == 4096
+    mine = toml("[expert]\ntotal_steps = 5000\n[airl]\npenalty_weight = 5\nmethod = 'irm'")
+    loaded = load_settings(LANDER, "smoke", mine)
+    assert (loaded.expert.total_steps, loaded.airl.penalty_weight) == (5000, 5.0)
+    loaded = load_settings(LANDER, "smoke", mine, ["expert.total_steps=6000"])
+    assert loaded.expert.total_steps == 6000
+    loaded = load_settings(
+        LANDER, "smoke", mine, [], {"airl.penalty_weight": 7.0, "airl.method": None}
+    )
+    assert (loaded.airl.penalty_weight, loaded.airl.method) == (7.0, "irm")
+
+
+def test_the_later_set_wins():
+    loaded = load_settings(LANDER, overrides=["airl.penalty_weight=1", "airl.penalty_weight=2"])
+    assert loaded.airl.penalty_weight == 2.0
+
+
+def test_a_layer_changes_only_what_it_names(toml):
+    before = load_settings(LANDER, "paper")
+    after = load_settings(LANDER, "paper", toml("[airl.ppo]\nn_envs = 3"))
+    assert after.airl.ppo.n_envs == 3
+    restored = msgspec.structs.replace(after.airl.ppo, n_envs=before.airl.ppo.n_envs)
+    airl = msgspec.structs.replace(after.airl, ppo=restored)
+    assert msgspec.structs.replace(after, airl=airl) == before
+
+
+def test_an_empty_file_changes_nothing(toml):
+    assert load_settings(LANDER, "smoke", toml("")) == load_settings(LANDER, "smoke")
+
+
+def test_environment_variables_never_enter(monkeypatch):
+    before = load_settings(LANDER)
+    for name in ("AIRL_METHOD", "IRL_AIRL_METHOD", "IRL_PROFILE", "IRL_SETTINGS", "airl.method"):
+        monkeypatch.setenv(name, "irm")
+    assert load_settings(LANDER) == before
+
+
+@pytest.mark.parametrize("text", ["30", "30.0", "3e1", " 30 ", "+30.0"])
+def test_however_written_it_is_one_value_and_so_one_key(toml, text):
+    """An int in TOML, a float on the command line: equal settings must give equal artefacts."""
+    expected = load_settings(LANDER, flags={"airl.penalty_weight": 30.0})
+    from_set = load_settings(LANDER, overrides=[f"airl.penalty_weight={text}"])
+    from_file = load_settings(LANDER, file=toml(f"[airl]\npenalty_weight = {text}"))
+    forms = {canonical_json(msgspec.to_builtins(s)) for s in (expected, from_set, from_file)}
+    assert len(forms) == 1
+
+
+# --set
+
+
+@pytest.mark.parametrize(
+    ("item", "value"),
+    [
+        ("airl.penalty_weight=30", 30.0),
+        ("airl.penalty_weight = 1e-3", 0.001),
+        ("airl.method=irm", "irm"),
+        ("airl.method='irm'", "irm"),
+        ('airl.method="erm-balanced"', "erm-balanced"),
+        ("airl.state_only=true", True),
+        ("airl.hidden=[8, 16]", (8, 16)),
+        ("airl.ppo.n_envs=4", 4),
+        ("expert.total_steps=1_000", 1000),
+        ("expert.bar=-5", -5.0),
+    ],
+)
+def test_set_is_typed_by_its_field(item, value):
+    loaded = load_settings(LANDER, overrides=[item])
+    for name in item.partition("=")[0].strip().split("."):
+        loaded = getattr(loaded, name)
+    assert loaded == value and type(loaded) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("item", "named", "hint"),
+    [
+        ("airl.penalty_weight", "has no '='", "--set airl.penalty_weight=30"),
+        ("", "has no '='", "--set"),
+        ("=3", "''", "known: "),
+        ("airl=3", "group", "airl.method"),
+        ("airl.ppo=3", "group", "airl.ppo.n_envs"),
+        ("airl.penalty_wieght=3", "airl.penalty_wieght", "did you mean 'penalty_weight'"),
+        ("arl.penalty_weight=3", "arl.penalty_weight", "did you mean 'airl'"),
+        ("airl.ppo.n_env=3", "airl.ppo.n_env", "did you mean 'n_envs'"),
+        ("airl.penalty_weight.x=3", "airl.penalty_weight", ""),
+        ("airl..method=irm", "airl..method", "known: "),
+        ("interventions.bounce=3", "interventions", "--intervention"),
+        ("profiles.smoke=3", "profiles.smoke", "known: "),
+        ("airl.method=IRM", "airl.method=IRM", "erm"),
+        ("airl.penalty_weight=abc", "airl.penalty_weight=abc", "10.0"),
+        ("airl.penalty_weight=true", "airl.penalty_weight=true", "10.0"),
+        ("airl.penalty_weight=", "airl.penalty_weight=", "10.0"),
+        ("airl.penalty_weight=-1", "airl.penalty_weight=-1", "10.0"),
+        ("airl.state_only=1", "airl.state_only=1", "false"),
+        ("airl.state_only=True", "airl.state_only=True", "false"),
+        ("airl.hidden=8", "airl.hidden=8", "[32,32]"),
+        ("airl.hidden=[8,0]", "airl.hidden=[8,0]", "[32,32]"),
+        ("airl.hidden=[[8]]", "airl.hidden", "[32,32]"),
+        ("airl.batch_size=7", "airl.batch_size=7", "256"),
+        ("airl.ppo.n_envs=0", "airl.ppo.n_envs=0", "16"),
+        ("airl.ppo.n_envs=1.5", "airl.ppo.n_envs=1.5", "16"),
+        ("airl.ppo.gamma=1", "airl.ppo.gamma=1", "0.999"),
+        ("airl.ppo.gamma=-0.1", "airl.ppo.gamma=-0.1", "0.999"),
+        ("airl.ppo.learning_rate=0", "airl.ppo.learning_rate=0", "0.001"),
+        ("airl.replay_share=1.1", "airl.replay_share=1.1", "0.5"),
+        ("expert.total_steps=1e6", "expert.total_steps=1e6", "1000000"),
+        ("evaluation.episodes=" + "9" * 30, "evaluation.episodes", "20"),
+        ("expert.total_steps=" + "9" * 5000, "expert.total_steps", "1000000"),
+        ("airl.hidden=" + "[" * 5000, "airl.hidden", "[32,32]"),
+    ],
+)
+def test_set_refuses_and_names(item, named, hint):
+    error = refused(overrides=[item])
+    assert named in error.message
+    assert hint in error.hint
+
+
+NON_FINITE = ["nan", "inf", "-inf", "+inf", "-nan"]
+
+
+@pytest.mark.parametrize("text", NON_FINITE)
+@pytest.mark.parametrize(
+    "field", ["airl.penalty_weight", "airl.learning_rate", "expert.bar", "transfer.ppo.clip_range"]
+)
+def test_numbers_that_no_key_can_hold_are_refused(toml, field, text):
+    """Later they would break in the middle of a run, with an error that names no setting."""
+    assert field in refused(overrides=[f"{field}={text}"]).message
+    group, _, name = field.rpartition(".")
+    path = toml(f"[{group}]\n{name} = {text}")
+    error = refused(file=path)
+    assert str(path) in error.message and field in error.message
+    error = refused(flags={field: float(text)})
+    assert name.replace("_", "-") in error.message
+
+
+# Files
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[airl",
+        "airl = ",
+        "a = 1\na = 2",
+        "= 1",
+        "[airl]\n[airl]",
+        b"\xff\xfe",
+        b"\0",
+        "x = " + "[" * 3000,
+        "x = " + "9" * 5000,
+    ],
+    ids=lambda t: repr(t[:12]),
+)
+def test_malformed_toml_names_the_file(toml, text):
+    path = toml(text)
+    error = refused(file=path)
+    assert str(path) in error.message and "TOML" in error.message
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    for path in (tmp_path / "absent.toml", tmp_path):
+        error = refused(file=path)
+        assert str(path) in error.message and "--settings" in error.hint
+
+
+@pytest.mark.parametrize(
+    ("text", "named", "hint"),
+    [
+        ("[arl]\nmethod = 'irm'", "'arl'", "did you mean 'airl'"),
+        ("[airl]\nmethd = 'irm'", "'airl.methd'", "did you mean 'method'"),
+        ("[airl.ppo]\nn_env = 3", "'airl.ppo.n_env'", "did you mean 'n_envs'"),
+        ("[profiles.smoke.airl]\nmethod = 'irm'", "'profiles'", "known: "),
+        ("airl = 3", "airl", ""),
+        ("airl = []", "airl", ""),
+        ("[airl]\nppo = 1", "airl.ppo", ""),
+        ("[airl]\nmethod = 'gail'", "airl.method", "erm"),
+        ("[airl]\npenalty_weight = '3'", "airl.penalty_weight", "10.0"),
+        ("[airl]\npenalty_weight = 2024-01-01", "airl.penalty_weight", "10.0"),
+        ("[airl]\nhidden = [8, 'x']", "airl.hidden", "[32,32]"),
+        ("[expert]\ntotal_steps = -1", "expert.total_steps", "1000000"),
+        ("[expert]\ntotal_steps = 99999999999999999999999", "expert.total_steps", "1000000"),
+        ("interventions = 3", "interventions", ""),
+        ("[interventions.bounce]\nid = ['0.1']\nood = ['1.5']", "bounce", "0 to 1"),
+        ("[interventions.bounce]\nid = ['soft']\nood = ['0.9']", "bounce", "bounce=0.5"),
+        ("[interventions.bounce]\nid = [0.1]\nood = ['0.9']", "interventions", ""),
+        ("[interventions.bounce]\nvalues = ['0.1']", "interventions", ""),
+        ("[interventions.leg-length]\nid = ['1x']\nood = ['2x']", "leg-length", "bounce"),
+    ],
+)
+def test_a_wrong_file_is_named_with_the_field(toml, text, named, hint):
+    path = toml(text)
+    error = refused(file=path)
+    assert str(path) in error.message
+    assert named in error.message
+    assert hint in error.hint
+
+
+def test_the_layer_at_fault_is_named_not_an_innocent_one(toml):
+    """A file may complete what it overrides only in part."""
+    path = toml("[interventions.engine-power]\nood = ['2x']")
+    assert load_settings(LANDER, file=path).interventions["engine-power"].ood == ("2x",)
+    error = refused(file=path, flags={"airl.method": "gail"})
+    assert "--method" in error.message and "gail" in error.message
+    assert str(path) not in error.message
+
+
+def test_flags_are_named_as_they_are_written():
+    error = refused(flags={"airl.penalty_weight": -3.0})
+    assert "--penalty-weight" in error.message
+
+
+@pytest.mark.parametrize(
+    ("profile", "hint"), [("smoky", "did you mean 'smoke'"), ("", "known: "), ("PAPER", "paper")]
+)
+def test_unknown_profile(profile, hint):
+    error = refused(profile)
+    assert repr(profile) in error.message and hint in error.hint
+
+
+@pytest.mark.parametrize("env", ["lunar-landr", "", "../lunar-lander", "/etc/passwd", "moon"])
+def test_unknown_environment_reads_no_file(env):
+    with pytest.raises(UsageError) as caught:
+        load_settings(env)
+    assert repr(env) in caught.value.message and "lunar-lander" in caught.value.hint
+
+
+# Anything at all
+
+
+@given(st.text(max_size=30) | st.from_regex(r"(airl|expert)\.[a-z_]{1,12}=.{0,12}", fullmatch=True))
+def test_any_set_is_taken_or_refused(item):
+    try:
+        settings = load_settings(LANDER, "smoke", overrides=[item])
+    except UsageError as error:
+        assert error.hint
+    else:
+        assert isinstance(settings, Settings)
+
+
+FLOAT_FIELDS = [
+    "airl.learning_rate",
+    "airl.penalty_weight",
+    "airl.replay_share",
+    "expert.ppo.gamma",
+    "expert.ppo.ent_coef",
+]
+
+
+@example("airl.penalty_weight", math.inf)
+@example("expert.ppo.gamma", math.nan)
+@given(st.sampled_from(FLOAT_FIELDS), st.floats())
+def test_what_is_taken_can_be_part_of_a_key(field, x):
+    try:
+        settings = load_settings(LANDER, flags={field: x})
+    except UsageError:
+        return
+    assert math.isfinite(x)
+    canonical_json(msgspec.to_builtins(settings))
+
+
+@given(
+    st.binary(max_size=60) | st.text("[]={}.\n'\"airl expt0123456789", max_size=60).map(str.encode)
+)
+def test_any_file_is_taken_or_refused(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_bytes(data)
+    try:
+        settings = load_settings(LANDER, file=path)
+    except UsageError as error:
+        assert str(path) in error.message and error.hint
+    else:
+        assert isinstance(settings, Settings)
