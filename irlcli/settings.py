@@ -58,7 +58,7 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     ortho_init: bool = True
     # For continuous actions. Unset is off (or SB3's default) and not part of an artefact's key:
     # what was made before these settings existed is still found.
-    log_std_init: float | UnsetType = UNSET
+    log_std_init: Finite | UnsetType = UNSET
     normalise_observations: bool | UnsetType = UNSET
     normalise_rewards: bool | UnsetType = UNSET
     use_sde: bool | UnsetType = UNSET
