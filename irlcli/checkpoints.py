@@ -11,12 +11,17 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import pickletools
+import stat
 import zipfile
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
+from msgspec import Struct
 
+from irlcli import descriptions
 from irlcli.errors import IntegrityError, NewerFormat, UsageError
 from irlcli.interventions import parse_setting
 from irlcli.irl.networks import RewardModel
@@ -25,6 +30,19 @@ from irlcli.rl import Policy, load_policy
 SCHEMA = 1
 # The networks here have tens of thousands of parameters; a larger file is not one of ours.
 _MAX_BYTES = 256 << 20
+_MAX_PICKLE_BYTES = 4 << 20
+# The only globals that plain tensors, numbers, strings, dicts and lists need.
+_STORAGES = ("FloatStorage", "DoubleStorage", "LongStorage", "IntStorage", "BoolStorage")
+_GLOBALS = {
+    "collections OrderedDict",
+    "torch._utils _rebuild_tensor_v2",
+    *(f"torch {name}" for name in _STORAGES),
+}
+_FORMS = {"reward": descriptions.Reward, "policy": descriptions.Policy}
+
+
+class RefusedCode(ValueError):
+    """A tensor file names something that loading it would call."""
 
 
 def to_bytes(value: Any) -> bytes:
@@ -35,19 +53,50 @@ def to_bytes(value: Any) -> bytes:
 
 
 def from_bytes(data: bytes) -> Any:
-    """The value that :func:`to_bytes` wrote."""
-    return torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")
+    """The value that :func:`to_bytes` wrote.
+
+    Raises:
+        ValueError: any other bytes (:class:`RefusedCode` for those that would run code).
+    """
+    try:
+        if data[:4] != b"PK\x03\x04":
+            # Torch would read anything else as a bare pickle.
+            raise ValueError("it is no zip archive")
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            # Entries are stored, as torch.save writes them, so nothing unpacks to more.
+            if sum(entry.file_size for entry in archive.infolist()) > _MAX_BYTES:
+                raise ValueError(f"it declares more than {_MAX_BYTES >> 20} MiB")
+            (name,) = (n for n in archive.namelist() if n.split("/", 1)[-1] == "data.pkl")
+            if archive.getinfo(name).file_size > _MAX_PICKLE_BYTES:
+                raise ValueError(f"its index is larger than {_MAX_PICKLE_BYTES >> 20} MiB")
+            _check_globals(archive.read(name))
+        return torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")
+    except RefusedCode:
+        raise
+    except pickle.UnpicklingError as error:
+        raise RefusedCode(str(error).splitlines()[0]) from None
+    except Exception as error:
+        # Whatever a crafted archive makes zipfile, pickle or torch raise.
+        raise ValueError((str(error) or type(error).__name__).splitlines()[0][:200]) from None
 
 
-def save(path: Path, kind: str, description: dict[str, Any], state: dict[str, Any]) -> None:
+def _check_globals(data: bytes) -> None:
+    """Refuse a pickle with other globals than ours: ``weights_only`` allows some that allocate."""
+    for opcode, argument, _ in pickletools.genops(data):
+        named = opcode.name in ("GLOBAL", "INST")
+        if (named and argument not in _GLOBALS) or opcode.name == "STACK_GLOBAL":
+            raise RefusedCode(f"it names {str(argument)[:80]!r}")
+
+
+def save(path: Path, kind: str, description: Struct, state: dict[str, Any]) -> None:
     """Write a tensor file of ``kind`` (``reward`` or ``policy``) that describes itself."""
-    text = json.dumps(description, sort_keys=True, allow_nan=False)
+    text = msgspec.json.encode(description, order="sorted").decode()
     path.write_bytes(
         to_bytes({"kind": kind, "schema": SCHEMA, "description": text, "state": state})
     )
 
 
-def load(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def load(path: Path, kind: str) -> tuple[Any, dict[str, Any]]:
     """(description, state) of the tensor file ``path``, which must be of ``kind``.
 
     Raises:
@@ -60,42 +109,44 @@ def load(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Any]]:
             f"{path} is no file of irlcli", f"a {kind} comes from a training stage"
         )
     if value["kind"] != kind:
-        raise UsageError(f"{path} is a {value['kind']}, not a {kind}", f"name a {kind} file")
+        if isinstance(value["kind"], str) and value["kind"] in _FORMS:
+            raise UsageError(f"{path} is a {value['kind']}, not a {kind}", f"name a {kind} file")
+        raise IntegrityError(f"{path} is of no known kind", f"a {kind} comes from a training stage")
     if type(value["schema"]) is not int:
         raise IntegrityError(f"{path} has no schema", f"a {kind} comes from a training stage")
     if value["schema"] > SCHEMA:
         raise NewerFormat(str(path), value["schema"], SCHEMA)
     try:
-        description = json.loads(value["description"])
-    except (TypeError, ValueError):
-        raise IntegrityError(f"{path} has no readable description") from None
+        text = value["description"]
+        description = json.loads(text) if isinstance(text, str) else None
+    except (ValueError, RecursionError):
+        description = None
     if not isinstance(description, dict) or not isinstance(value["state"], dict):
-        raise IntegrityError(f"{path} is malformed")
-    return description, value["state"]
+        raise IntegrityError(f"{path} has no readable description")
+    return descriptions.parse(description, _FORMS[kind], path), value["state"]
 
 
 def _read(path: Path) -> Any:
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        information = path.stat()
+        if not stat.S_ISREG(information.st_mode):
+            # Opening a named pipe would wait for a writer that never comes.
+            raise IntegrityError(f"{path} is not a plain file")
+        if information.st_size > _MAX_BYTES:
             raise IntegrityError(f"{path} is larger than {_MAX_BYTES >> 20} MiB")
-        with zipfile.ZipFile(path) as archive:
-            # Stored entries only, as torch.save writes them: nothing can unpack to more.
-            if sum(entry.file_size for entry in archive.infolist()) > _MAX_BYTES:
-                raise IntegrityError(f"{path} declares more than {_MAX_BYTES >> 20} MiB")
-        return torch.load(path, weights_only=True, map_location="cpu")
-    except pickle.UnpicklingError:
+        return from_bytes(path.read_bytes())
+    except RefusedCode as error:
         raise IntegrityError(
-            f"{path} holds more than tensors and was refused: loading it could run code",
+            f"{path} holds more than tensors and was refused: loading it could run code ({error})",
             "a file of irlcli holds tensors only; do not trust where this one came from",
         ) from None
-    except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError, KeyError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise IntegrityError(f"{path} is not a tensor file ({reason})") from None
+    except ValueError as error:
+        raise IntegrityError(f"{path} is not a tensor file ({error})") from None
     except OSError as error:
         raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
 
 
-def load_policy_file(path: Path) -> tuple[Policy, dict[str, Any]]:
+def load_policy_file(path: Path) -> tuple[Policy, descriptions.Policy]:
     """A policy and its description.
 
     Raises:
@@ -103,13 +154,13 @@ def load_policy_file(path: Path) -> tuple[Policy, dict[str, Any]]:
     """
     description, state = load(path, "policy")
     try:
-        setting = parse_setting(description["env"], description["settings"][0])
-        return load_policy(description["network"], state, setting), description
-    except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+        setting = parse_setting(description.env, description.settings[0])
+        return load_policy(description.network, state, setting), description
+    except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise _misfit(path, error) from None
 
 
-def load_reward_file(path: Path) -> tuple[RewardModel, dict[str, Any]]:
+def load_reward_file(path: Path) -> tuple[RewardModel, descriptions.Reward]:
     """A reward model, frozen, and its description.
 
     Raises:
@@ -117,7 +168,7 @@ def load_reward_file(path: Path) -> tuple[RewardModel, dict[str, Any]]:
     """
     description, state = load(path, "reward")
     try:
-        model = RewardModel(**description["network"])
+        model = RewardModel(**msgspec.to_builtins(description.network))
         model.load_state_dict(state)
     except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise _misfit(path, error) from None

@@ -1,7 +1,6 @@
 """The command line: parse, call the runner, print. Heavy libraries load only where work is done."""
 
 import inspect
-import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -58,6 +57,9 @@ class Session:
         """Run requests (or plan them, with --dry-run) and print one line for each."""
         from irlcli.runner import Runner
 
+        if name is not None:
+            # Before the work, not after it.
+            self.store.check_name(name)
         runner = Runner(self.store, self._console, self._wait, workers=self._workers)
         if self._dry_run:
             self._print_plan([step for request in requests for step in runner.plan(request)])
@@ -219,15 +221,15 @@ def transfer(
     from irlcli.stages import transfer
 
     source, origin = tensor_file(session.store, reward, "reward")
-    _same_env(reward, origin["env"], env)
-    config = session.settings(origin["env"])
-    settings = _settings(origin["env"], config, ood, "ood", origin)
+    _same_env(reward, origin.env, env)
+    config = session.settings(origin.env)
+    settings = _settings(origin.env, config, ood, "ood", origin)
     if len(settings) != 1:
         names = ", ".join(str(s) for s in settings)
         raise UsageError(
             f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one"
         )
-    request = transfer.request(source, origin["env"], settings[0], config.transfer, seed)
+    request = transfer.request(source, origin.env, settings[0], config.transfer, seed)
     session.deliver([request], name)
 
 
@@ -274,14 +276,14 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
     from irlcli.stages import evaluate
 
     source, origin = tensor_file(session.store, policy, "policy")
-    _same_env(policy, origin["env"], env)
-    config = session.settings(origin["env"], {"evaluation.episodes": episodes})
+    _same_env(policy, origin.env, env)
+    config = session.settings(origin.env, {"evaluation.episodes": episodes})
     if ood is not None or intervention is not None:
         kind = "id" if ood is None else "ood"
-        settings = _settings(origin["env"], config, ood or intervention, kind, origin)
+        settings = _settings(origin.env, config, ood or intervention, kind, origin)
     else:
-        settings = [parse_setting(origin["env"], s) for s in origin["settings"]]
-    request = evaluate.request(origin["env"], settings, config.evaluation, source, seed=seed)
+        settings = [parse_setting(origin.env, s) for s in origin.settings]
+    request = evaluate.request(origin.env, settings, config.evaluation, source, seed=seed)
     return session.deliver([request], name)
 
 
@@ -335,9 +337,7 @@ def _same_env(ref: str, learned: str, wanted: str | None) -> None:
         )
 
 
-def _settings(
-    env: str, config: Any, text: str, kind: str, origin: dict[str, Any] | None = None
-) -> Sequence[Any]:
+def _settings(env: str, config: Any, text: str, kind: str, origin: Any = None) -> Sequence[Any]:
     """The settings that ``text`` names.
 
     ``knob=3x,4x``; a knob alone stands for the values listed for it (``kind`` id or ood) in the
@@ -353,7 +353,7 @@ def _settings(
     if origin is None or text in environment(env).knobs or text[:1].isalpha():
         knob_of(env, text)
         raise UsageError(f"{text!r} names no value", f"write {text}=VALUE,VALUE")
-    knob, equals, _ = origin["settings"][0].partition("=")
+    knob, equals, _ = origin.settings[0].partition("=")
     if not equals:
         raise UsageError(f"{text!r} names no knob", "write KNOB=VALUE")
     return parse_settings(env, f"{knob}={text}")
@@ -375,8 +375,8 @@ def play(
     from irlcli.references import tensor_file
 
     source, origin = tensor_file(session.store, policy, "policy")
-    env = origin["env"]
-    settings = [parse_setting(env, text) for text in origin["settings"]]
+    env = origin.env
+    settings = [parse_setting(env, text) for text in origin.settings]
     if ood is not None:
         added = _settings(env, session.settings(env), ood, "ood", origin)
         settings += [setting for setting in added if setting not in settings]
@@ -386,7 +386,10 @@ def play(
     from irlcli.checkpoints import load_policy_file
     from irlcli.play import write_gif
 
-    player, _ = load_policy_file(source.path)
+    path = source.path
+    if source.artefact is not None:
+        path = session.store.open(source.artefact, path.name)
+    player, _ = load_policy_file(path)
     try:
         write_gif(file, player, env, settings, steps, seed)
     except OSError as error:
@@ -430,12 +433,18 @@ def ls(
 
 
 def _about(parameters: dict[str, Any]) -> str:
-    """The parameters that tell one artefact of a stage from another."""
-    settings = parameters.get("settings") or [parameters.get("setting")]
-    parts = [parameters.get("env"), parameters.get("agent"), *settings]
-    parts.append(parameters.get("airl", {}).get("method"))
+    """The parameters that tell one artefact of a stage from another.
+
+    Any artefact has parameters, also one that somebody made up: nothing is taken for granted.
+    """
+    airl = parameters.get("airl")
+    settings = parameters.get("settings")
+    parts = [parameters.get("env"), parameters.get("agent")]
+    parts += settings if isinstance(settings, list) else [parameters.get("setting")]
+    parts.append(airl.get("method") if isinstance(airl, dict) else None)
     parts.append(f"seed {parameters['seed']}" if "seed" in parameters else None)
-    return " ".join(str(p) for p in parts if p and p != "policy")
+    text = " ".join(str(p) for p in parts if p and p != "policy")
+    return "".join(c if c.isprintable() else "?" for c in text)[:200]
 
 
 @command("show", runs=False)
@@ -530,6 +539,8 @@ def gc(
     grace_days: Annotated[float, typer.Option(min=0, help="Spare what is younger [days].")] = 7.0,
 ) -> None:
     """Find (and with --delete remove) artefacts that no name leads to."""
+    if not grace_days >= 0:
+        raise UsageError(f"--grace-days {grace_days} is no number of days", "0 or more")
     grace = grace_days * 86400
     if delete:
         artefacts, work = session.store.collect(grace)
@@ -650,15 +661,16 @@ def main() -> None:
     as_json = "--json" in sys.argv
     try:
         build_app(sys.argv[1:])(standalone_mode=False)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # Whoever read our output has enough; Python would complain again at shutdown.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
     except KeyboardInterrupt:
         _fail(Interrupted("interrupted", "run the same command again to go on"), as_json)
     except IrlError as error:
         _fail(error, as_json)
+    except OSError as error:
+        if _debugging():
+            raise
+        where = f": {error.filename}" if error.filename else ""
+        hint = "nothing is half-written: mend the cause and run the same command again"
+        _fail(StageFailed(f"{error.strerror or error}{where}", hint), as_json)
     except Exception as error:
         if hasattr(error, "format_message"):
             _fail(_usage(error), as_json)

@@ -135,13 +135,18 @@ class TerminalConsole:
 
 
 def print_data(text: str) -> None:
-    """One line of data on stdout."""
-    print(text, flush=True)
+    """Lines of data on stdout; quietly the end of the program if nobody reads them any more."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # Python would complain again when it flushes at shutdown.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
 
 
 def print_json(kind: str, value: Mapping[str, Any]) -> None:
     """One JSON document on stdout, with the version of its form."""
-    print(json.dumps({"version": JSON_VERSION, "kind": kind, **value}, sort_keys=True), flush=True)
+    print_data(json.dumps({"version": JSON_VERSION, "kind": kind, **value}, sort_keys=True))
 
 
 def print_table(
@@ -155,7 +160,10 @@ def print_table(
         for row in [columns, *rows]:
             cells = (str(c).ljust(w) for c, w in zip(row, widths, strict=True))
             lines.append("  ".join(cells).rstrip())
-        print("\n".join(lines), file=stream, flush=True)
+        if stderr:
+            print("\n".join(lines), file=stream, flush=True)
+        else:
+            print_data("\n".join(lines))
         return
     from rich.console import Console
     from rich.table import Table

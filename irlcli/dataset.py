@@ -153,7 +153,7 @@ def read_metadata(directory: Path) -> dict[str, Any]:
         raise IntegrityError(
             f"{directory} holds no demonstrations: {EPISODES} is missing"
         ) from None
-    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError) as error:
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, RecursionError) as error:
         raise IntegrityError(
             f"{path} is not a demonstrations file ({_first_line(error)})",
             "demonstrations come from `irl collect-experts`",
@@ -173,43 +173,57 @@ def read_demonstrations(directory: Path) -> Demonstrations:
     try:
         episodes = pq.read_table(directory / EPISODES, page_checksum_verification=True)
         steps = pq.read_table(directory / STEPS, page_checksum_verification=True)
-        trajectories = _parse(steps, episodes.to_pylist())
+        trajectories = _parse(steps, episodes)
     except FileNotFoundError as error:
         raise IntegrityError(f"{error.filename or STEPS} is missing in {directory}") from None
-    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError) as error:
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, RecursionError) as error:
         raise IntegrityError(
             f"the demonstrations in {directory} are damaged ({_first_line(error)})"
         ) from None
     return Demonstrations(tags["env"], trajectories, tags)
 
 
-def _parse(steps: pa.Table, episodes: list[dict]) -> dict[str, tuple[Trajectory, ...]]:
-    episode_of_step = steps["episode"].to_numpy()
-    observations = _matrix(steps["obs"])
-    action_column = steps["action"]
-    discrete = pa.types.is_integer(action_column.type)
-    actions = action_column.to_numpy() if discrete else _matrix(action_column)
-    rewards = steps["reward"].to_numpy()
-    if not np.array_equal(
-        episode_of_step, np.repeat(np.arange(len(episodes)), [e["length"] for e in episodes])
+def _parse(steps: pa.Table, episodes: pa.Table) -> dict[str, tuple[Trajectory, ...]]:
+    obs_type, action_type = steps.schema.field("obs").type, steps.schema.field("action").type
+    if not pa.types.is_fixed_size_list(obs_type):
+        raise ValueError("obs is no fixed_size_list")
+    discrete = pa.types.is_integer(action_type)
+    if not discrete and not pa.types.is_fixed_size_list(action_type):
+        raise ValueError("action is neither int64 nor a fixed_size_list")
+    size = obs_type.list_size
+    expected = _steps_schema(size, None if discrete else action_type.list_size)
+    for table, schema in ((steps, expected), (episodes, _episodes_schema(size))):
+        if not table.schema.equals(schema, check_metadata=False):
+            raise ValueError("columns or their types are not those of a dataset")
+        if any(column.null_count for column in table.columns):
+            raise ValueError("a column holds nulls")
+    rows = episodes.to_pylist()
+    if not rows:
+        raise ValueError("there is no episode in it")
+    lengths = [row["length"] for row in rows]
+    if min(lengths) < 1 or not np.array_equal(
+        steps["episode"].to_numpy(), np.repeat(np.arange(len(rows)), lengths)
     ):
         raise ValueError("steps and episodes do not fit each other")
+    observations = _matrix(steps["obs"])
+    actions = steps["action"].to_numpy() if discrete else _matrix(steps["action"])
+    rewards = steps["reward"].to_numpy()
     groups: dict[str, list[Trajectory]] = {}
     start = 0
-    for episode in episodes:
-        stop = start + episode["length"]
-        final = np.asarray(episode["final_obs"], dtype=np.float32)
+    for row in rows:
+        stop = start + row["length"]
+        final = np.asarray(row["final_obs"], dtype=np.float32)
         trajectory = Trajectory(
             observations=np.vstack([observations[start:stop], final]),
             actions=np.array(actions[start:stop]),
             rewards=np.array(rewards[start:stop]),
-            terminated=episode["terminated"],
-            truncated=episode["truncated"],
-            seed=episode["seed"],
+            terminated=row["terminated"],
+            truncated=row["truncated"],
+            seed=row["seed"],
         )
-        if trajectory.episode_return != episode["return"]:
-            raise ValueError(f"episode {episode['episode']} does not add up to its return")
-        groups.setdefault(episode["setting"], []).append(trajectory)
+        if trajectory.episode_return != row["return"]:
+            raise ValueError(f"episode {row['episode']} does not add up to its return")
+        groups.setdefault(row["setting"], []).append(trajectory)
         start = stop
     return {setting: tuple(group) for setting, group in groups.items()}
 
@@ -218,8 +232,6 @@ def _matrix(column: pa.ChunkedArray) -> np.ndarray:
     flat = column.combine_chunks()
     if isinstance(flat, pa.ChunkedArray):
         flat = flat.chunk(0)
-    if flat.null_count:
-        raise ValueError("a column holds nulls")
     return flat.flatten().to_numpy().reshape(len(column), -1)
 
 

@@ -43,6 +43,9 @@ class IntegrityError(IrlError):
 
     exit_code = 4
 
+    def __init__(self, message: str, hint: str = "make it again, or name another"):
+        super().__init__(message, hint)
+
 
 class NewerFormat(IntegrityError):
     """Sound bytes in a form that only a newer version of this program knows (exit 4)."""

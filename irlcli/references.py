@@ -7,15 +7,18 @@ output says so and no tensor library is loaded; a foreign file is opened and ask
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-from irlcli.errors import IntegrityError, NotFound, UsageError
+from irlcli import descriptions
+from irlcli.errors import NotFound, UsageError
 from irlcli.runner import source_of
 from irlcli.stages import Source
 from irlcli.store import Artefact, Resolved, Store, read_json
 
 
-def tensor_file(store: Store, ref: str, kind: str) -> tuple[Source, dict[str, Any]]:
+def tensor_file(
+    store: Store, ref: str, kind: Literal["reward", "policy"]
+) -> tuple[Source, descriptions.Reward | descriptions.Policy]:
     """The ``reward`` or ``policy`` that ``ref`` names, and its description.
 
     A reference to a whole artefact stands for its file of that kind.
@@ -41,7 +44,9 @@ def tensor_file(store: Store, ref: str, kind: str) -> tuple[Source, dict[str, An
             f"{ref!r} is {output}, not a {kind}", f"name {artefact.id}/{kind}.pt or the artefact"
         )
     source = source_of(Resolved(artefact, artefact.directory / output))
-    return source, read_json(store.open(artefact, f"{kind}.json"))
+    form = descriptions.Reward if kind == "reward" else descriptions.Policy
+    path = store.open(artefact, _only(artefact, f"{kind}.json"))
+    return source, descriptions.parse(read_json(path), form, path)
 
 
 def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
@@ -66,10 +71,11 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
             f"{ref!r} is {what}, not a dataset of demonstrations",
             "name an artefact that `irl collect-experts` made",
         )
-    return source_of(resolved), record.parameters["env"], list(record.parameters["settings"])
+    about = descriptions.parse(record.parameters, descriptions.Dataset, artefact.directory)
+    return source_of(resolved), about.env, list(about.settings)
 
 
-def evaluation(store: Store, ref: str) -> tuple[Artefact, dict[str, Any]]:
+def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluation]:
     """The evaluation that ``ref`` names and its summary.
 
     Raises:
@@ -80,10 +86,8 @@ def evaluation(store: Store, ref: str) -> tuple[Artefact, dict[str, Any]]:
     artefact = store.resolve(ref).artefact
     if artefact is None or artefact.manifest.record.stage != "evaluate":
         raise UsageError(f"{ref!r} is no evaluation", "name artefacts that `irl evaluate` made")
-    summary = read_json(store.open(artefact, "summary.json"))
-    if not isinstance(summary, dict):
-        raise IntegrityError(f"{ref!r} has no readable summary")
-    return artefact, summary
+    path = store.open(artefact, _only(artefact, "summary.json"))
+    return artefact, descriptions.parse(read_json(path), descriptions.Evaluation, path)
 
 
 def _only(artefact: Artefact, name: str) -> str:

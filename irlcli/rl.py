@@ -27,6 +27,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from irlcli import envs
+from irlcli.descriptions import PolicyNetwork
 from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
 from irlcli.errors import StageFailed, UsageError
@@ -384,41 +385,40 @@ class Policy:
         return self.network.state_dict()
 
     @staticmethod
-    def describe(env: str, ppo: PPOSettings) -> dict[str, Any]:
-        """JSON that, with the tensors, is enough to rebuild the policy (``load_policy``)."""
-        return {
-            "algorithm": "ppo",
-            "env": env,
-            "net_arch": list(ppo.net_arch),
-            "activation": ppo.activation,
-            "ortho_init": ppo.ortho_init,
-            "normalise_observations": bool(ppo.normalise_observations),
-            "use_sde": bool(ppo.use_sde),
-        }
+    def describe(env: str, ppo: PPOSettings) -> PolicyNetwork:
+        """What, with the tensors, is enough to rebuild the policy (``load_policy``)."""
+        return PolicyNetwork(
+            algorithm="ppo",
+            env=env,
+            net_arch=ppo.net_arch,
+            activation=ppo.activation,
+            ortho_init=ppo.ortho_init,
+            normalise_observations=bool(ppo.normalise_observations),
+            use_sde=bool(ppo.use_sde),
+        )
 
 
 def load_policy(
-    description: dict[str, Any], state: dict[str, torch.Tensor], setting: Setting
+    network_: PolicyNetwork, state: dict[str, torch.Tensor], setting: Setting
 ) -> Policy:
     """The policy that ``Policy.describe`` and ``Policy.state_dict`` wrote down.
 
     ``setting`` is one that it was trained in: a goal, for one, adds to the observation.
 
     Raises:
-        KeyError, RuntimeError: the description and the tensors do not fit each other.
+        RuntimeError: the description and the tensors do not fit each other.
     """
     torch.set_num_threads(1)
-    world = envs.make(description["env"], setting)
+    world = envs.make(network_.env, setting)
     network = ActorCriticPolicy(
         world.observation_space,
         world.action_space,
         lambda _: 0.0,
-        net_arch=list(description["net_arch"]),
-        activation_fn=_ACTIVATIONS[description["activation"]],
-        ortho_init=description["ortho_init"],
-        # Policies saved before these could be set have neither.
-        features_extractor_class=_extractor(description.get("normalise_observations", False)),
-        use_sde=description.get("use_sde", False),
+        net_arch=list(network_.net_arch),
+        activation_fn=_ACTIVATIONS[network_.activation],
+        ortho_init=network_.ortho_init,
+        features_extractor_class=_extractor(network_.normalise_observations),
+        use_sde=network_.use_sde,
     )
     world.close()
     network.load_state_dict(state)

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from irlcli.errors import Interrupted, StageFailed, UsageError
+from irlcli.errors import IntegrityError, Interrupted, StageFailed, UsageError
 from irlcli.stages import Console, From, Job, Request, Source
 from irlcli.store import (
     Artefact,
@@ -308,6 +308,7 @@ def source_of(resolved: Resolved) -> Source:
 
     Raises:
         UsageError: a foreign directory without files, or one that cannot be read.
+        IntegrityError: a directory that holds links, pipes or names no artefact could have.
     """
     if resolved.artefact is not None:
         return _source(resolved.artefact, resolved.output)
@@ -319,7 +320,13 @@ def source_of(resolved: Resolved) -> Source:
             raise UsageError(f"{resolved.path} holds no files", "name a file or an artefact")
         return Source(resolved.path, content_digest(outputs))
     except OSError as error:
-        raise UsageError(f"{resolved.path} cannot be read ({error.strerror})") from None
+        raise UsageError(
+            f"{resolved.path} cannot be read ({error.strerror})", "name a file or an artefact"
+        ) from None
+    except ValueError as error:
+        raise IntegrityError(
+            f"{resolved.path}: {error}", "name a directory of plain files, or an artefact"
+        ) from None
 
 
 def _source(artefact: Artefact, output: str | None) -> Source:

@@ -29,7 +29,8 @@ Finite = Annotated[float, Meta(ge=-_LARGE, le=_LARGE)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 # gamma = 1 would make the value of an absorbing state infinite.
 Discount = Annotated[float, Meta(ge=0, lt=1)]
-Widths = tuple[Count, ...]
+# Bounded, so that no description can ask for a network that does not fit memory.
+Widths = Annotated[tuple[Annotated[int, Meta(ge=1, le=1024)], ...], Meta(max_length=6)]
 Schedule = Literal["constant", "linear"]
 Activation = Literal["tanh", "relu"]
 Method = Literal["erm", "erm-balanced", "irm"]

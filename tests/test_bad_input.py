@@ -368,10 +368,22 @@ def test_no_code_in_a_checkpoint_is_run(irl, store_copy, tmp_path, kind):
         assert_answered(result, 4, "checkpoint")
 
 
+NETWORK = {
+    "observation_size": 8,
+    "action_size": 4,
+    "discrete": True,
+    "state_only": False,
+    "hidden": [32, 32],
+    "activation": "tanh",
+    "gamma": 0.99,
+}
+
+
 def description(**changes) -> bytes:
     """A reward file of no parameters that describes itself as ``changes`` say."""
     origin = {"env": "lunar-lander", "settings": ["engine-power=1x"], "method": "erm", "seed": 0}
-    origin |= {"network": {}, "scale": 1.0, "airl": {"fixed_horizon": True}}
+    # Sound but for the changes, so that each of them is what is refused.
+    origin |= {"network": NETWORK, "scale": 1.0, "airl": {"fixed_horizon": True}}
     origin = {name: value for name, value in {**origin, **changes}.items() if value is not Ellipsis}
     return tensor_file(description=json.dumps(origin))
 
@@ -486,7 +498,7 @@ def test_fuzz_a_real_reward_file(smoke_store, archive_path, at, bit, cut):
     except IrlError as error:
         assert "fuzzed.pt" in error.message
     else:
-        assert not cut and origin["env"] == "lunar-lander" and model.g is not None
+        assert not cut and origin.env == "lunar-lander" and model.g is not None
 
 
 def test_files_that_are_no_tensor_files(irl, store_copy, tmp_path):
@@ -838,16 +850,7 @@ def test_a_fifo_is_no_tensor_file(store_copy, tmp_path):
 def test_small_files_take_no_large_memory(store_copy, tmp_path, kind):
     """A description of a huge network, a pickle that asks for a huge buffer: a kilobyte each."""
     if kind == "network":
-        network = {
-            "observation_size": 8,
-            "action_size": 4,
-            "discrete": True,
-            "state_only": False,
-            "hidden": [9000, 9000],
-            "activation": "tanh",
-            "gamma": 0.99,
-        }
-        data = description(network=network)
+        data = description(network=NETWORK | {"hidden": [9000, 9000]})
     else:
         data = b"\x80\x02cbuiltins\nbytearray\nJ" + (800 << 20).to_bytes(4, "little") + b"\x85R."
     path = torch_zip(tmp_path / "greedy.pt", data)

@@ -1,6 +1,7 @@
 """The PyBullet robots in the chain: continuous actions, normalisation, progress, workers, play."""
 
 import math
+import shutil
 from types import SimpleNamespace
 
 import gymnasium
@@ -196,10 +197,8 @@ def test_environments_without_progress_report_none():
 
 
 @pytest.fixture(scope="module")
-def chains(tmp_path_factory):
+def chains(tmp_path_factory, run_irl):
     """The Reacher's chain with one worker and with two, by the command line: two stores."""
-    from conftest import run_main
-
     base = tmp_path_factory.mktemp("robots")
     for workers in ("1", "2"):
         common = ["--store", str(base / workers), "--profile", "smoke", "--quiet"]
@@ -210,7 +209,7 @@ def chains(tmp_path_factory):
             ["transfer", "--reward", "airl", "--ood", "gravity", *common, "moved"],
             ["evaluate", "--policy", "moved", *common, "score"],
         ):
-            done = run_main(arguments)
+            done = run_irl(arguments)
             assert done.code == 0, done.err
     return base
 
@@ -267,6 +266,17 @@ def test_play_draws_the_settings_side_by_side(chains, irl, tmp_path):
     # Gravity turns no joint of the Reacher: the same picture, whatever the caption says.
     np.testing.assert_array_equal(left, middle)
     assert (picture[:16, :320] != picture[:16, 320:640]).any()
+
+
+def test_play_refuses_a_damaged_policy(chains, irl, tmp_path):
+    store = tmp_path / "runs"
+    shutil.copytree(chains / "1", store, symlinks=True)
+    path = Store(store).resolve("moved").artefact.directory / "policy.pt"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-1] + b"!")
+    done = irl("play", "moved", "--store", store, "--out", tmp_path / "x.gif")
+    assert done.code == 4 and "hint:" in done.err
+    assert not (tmp_path / "x.gif").exists()
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ workers.
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import signal
 from collections.abc import Callable, Sequence
@@ -127,7 +128,7 @@ class WorkerWorlds:
         )
         self._actions, self._observations, self._rewards = shared.views()
         bounds = [self._size * worker // workers for worker in range(workers + 1)]
-        self._shares = list(zip(bounds[:-1], bounds[1:], strict=True))
+        self._shares = list(itertools.pairwise(bounds))
         # A spawned process inherits no pipe end of its siblings, which would hide a death.
         context = multiprocessing.get_context("spawn")
         self._connections: list[Connection] = []

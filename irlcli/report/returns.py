@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+
+from irlcli.descriptions import Evaluation, Subject
 
 _ORDER = ("expert", "student", "transfer", "random", "idle")
 _WHAT = {"student": "zero-shot", "transfer": "transfer"}
@@ -33,19 +34,18 @@ class Row:
         return statistics.stdev(self.returns) if len(self.returns) > 1 else None
 
 
-def rows(summaries: Iterable[Mapping[str, Any]]) -> list[Row]:
+def rows(summaries: Iterable[Evaluation]) -> list[Row]:
     """Rows of evaluation summaries (``summary.json``), one per agent, method and setting.
 
     Experts first, random and idle last.
     """
     groups: dict[tuple[int, str, str, str], list[tuple[float, int, float | None]]] = {}
     for summary in summaries:
-        policy = summary["policy"]
-        order = _ORDER.index(policy["agent"])
-        for item in summary["settings"]:
-            key = (order, agent_name(policy), policy["env"], item["setting"])
-            # Evaluations from before progress was measured have none.
-            values = item["mean_return"], item["episodes"], item.get("mean_progress")
+        policy = summary.policy
+        order = _ORDER.index(policy.agent)
+        for item in summary.settings:
+            key = (order, agent_name(policy), policy.env, item.setting)
+            values = item.mean_return, item.episodes, item.mean_progress
             groups.setdefault(key, []).append(values)
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):
@@ -55,7 +55,7 @@ def rows(summaries: Iterable[Mapping[str, Any]]) -> list[Row]:
     return found
 
 
-def agent_name(policy: Mapping[str, Any]) -> str:
+def agent_name(policy: Subject) -> str:
     """``expert``, ``airl-irm transfer``, ``airl-erm zero-shot``, ``random``, ``idle``."""
-    agent = policy["agent"]
-    return f"airl-{policy['method']} {_WHAT[agent]}" if agent in _WHAT else agent
+    agent = policy.agent
+    return f"airl-{policy.method} {_WHAT[agent]}" if agent in _WHAT else agent

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import torch
 
-from irlcli import checkpoints
+from irlcli import checkpoints, descriptions
 from irlcli.dataset import Demonstrations
 from irlcli.envs.vector import VectorWorlds
 from irlcli.errors import IntegrityError, StageFailed
@@ -54,17 +55,17 @@ class Adversary:
                 f"{self._expert[0].observations.shape[1]}, {demos.env} has {size}"
             )
         discrete = isinstance(worlds.action_space, gymnasium.spaces.Discrete)
-        self._network = {
-            "observation_size": size,
-            "action_size": int(worlds.action_space.n) if discrete else worlds.action_space.shape[0],
-            "discrete": discrete,
-            "state_only": config.state_only,
-            "hidden": list(config.hidden),
-            "activation": config.activation,
-            "gamma": config.ppo.gamma,
-        }
+        self._network = descriptions.RewardNetwork(
+            observation_size=size,
+            action_size=int(worlds.action_space.n) if discrete else worlds.action_space.shape[0],
+            discrete=discrete,
+            state_only=config.state_only,
+            hidden=config.hidden,
+            activation=config.activation,
+            gamma=config.ppo.gamma,
+        )
         torch.manual_seed(self._derived_seed(0))
-        self.model = RewardModel(**self._network)
+        self.model = RewardModel(**msgspec.to_builtins(self._network))
         self._optimizer = torch.optim.Adam(
             self.model.parameters(),
             lr=config.learning_rate,
@@ -214,11 +215,14 @@ class Adversary:
             for d in state["past"]
         ]
 
-    def write_reward(self, directory: Path, origin: Mapping[str, Any]) -> None:
-        """Write ``reward.pt`` and, for readers without torch, ``reward.json``."""
-        description = {**origin, "network": self._network, "scale": self._scale}
+    def write_reward(self, directory: Path, **origin: Any) -> None:
+        """Write ``reward.pt`` and, for readers without torch, ``reward.json``.
+
+        ``origin`` are the fields of ``descriptions.Reward`` besides the network and the scale.
+        """
+        description = descriptions.Reward(network=self._network, scale=self._scale, **origin)
         checkpoints.save(directory / "reward.pt", "reward", description, self.model.state_dict())
-        write_json(directory / "reward.json", description)
+        write_json(directory / "reward.json", msgspec.to_builtins(description))
 
 
 def rollout_transitions(rollout: Rollout, worlds: np.ndarray | slice, horizon: int) -> Transitions:

@@ -67,7 +67,7 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_demonstrations
-    from irlcli.stages.outputs import shown, write_json
+    from irlcli.stages.outputs import shown, warn_of_errors, write_json
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
@@ -78,9 +78,7 @@ def run(job: Job) -> None:
         seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
         trajectories = rl.roll_out(p.env, setting, policy, episodes, seed, p.deterministic)
         returns = np.array([t.episode_return for t in trajectories])
-        for k, t in enumerate(trajectories):
-            if t.error is not None:
-                job.console.warn(f"{text}, episode {k}: {t.error}; the episode ended there")
+        warn_of_errors(job, text, trajectories)
         met = None if p.bar is None else bool(returns.mean() >= p.bar)
         if met is False:
             job.console.warn(

@@ -49,12 +49,14 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_table
-    from irlcli.stages.outputs import shown, write_json
+    from irlcli.stages.outputs import shown, warn_of_errors, write_json
 
     p: Parameters = job.parameters
-    policy, origin = p.agent, {"agent": p.agent, "env": p.env}
+    policy, subject = p.agent, {"agent": p.agent, "env": p.env}
     if "policy" in job.inputs:
         policy, origin = load_policy_file(job.inputs["policy"])
+        subject = msgspec.to_builtins(origin)
+        del subject["network"]
     rows, summary = [], []
     for index, text in enumerate(p.settings):
         seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
@@ -66,9 +68,7 @@ def run(job: Job) -> None:
             seed,
             p.evaluation.deterministic,
         )
-        for k, t in enumerate(trajectories):
-            if t.error is not None:
-                job.console.warn(f"{text}, episode {k}: {t.error}; the episode ended there")
+        warn_of_errors(job, text, trajectories)
         progress = float(np.mean([t.progress for t in trajectories]))
         rows += [
             {
@@ -98,7 +98,6 @@ def run(job: Job) -> None:
             index + 1, len(p.settings), "settings", {text: shown(returns.mean(), progress)}
         )
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
-    subject = {key: value for key, value in origin.items() if key not in ("network", "airl")}
     write_json(job.output / "summary.json", {"policy": subject, "settings": summary})
 
 

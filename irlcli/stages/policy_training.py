@@ -33,9 +33,8 @@ def train_rounds(
     first, rows = 0, []
     if adversary is not None:
         reward = adversary.reward
-    stored = job.checkpoints.load()
-    if stored is not None:
-        state = checkpoints.from_bytes(stored)
+    state = _restored(job)
+    if state is not None:
         trainer.load_state_dict(state["trainer"])
         if adversary is not None:
             adversary.load_state_dict(state["adversary"])
@@ -53,6 +52,17 @@ def train_rounds(
         _report(job, trainer, newest)
         job.checkpoints.offer(partial(_state, trainer, adversary, index + 1, rows))
     return rows
+
+
+def _restored(job: Job) -> dict[str, Any] | None:
+    stored = job.checkpoints.load()
+    if stored is None:
+        return None
+    try:
+        return checkpoints.from_bytes(stored)
+    except ValueError as error:
+        job.console.warn(f"the checkpoint cannot be used ({error}): starting over")
+        return None
 
 
 def _state(

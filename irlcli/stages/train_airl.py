@@ -73,15 +73,9 @@ def run(job: Job) -> None:
         trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
         adversary = Adversary(demos, p.airl, worlds, p.seed)
         rows = train_rounds(job, trainer, settings, adversary=adversary)
-    origin = {
-        "env": demos.env,
-        "settings": settings,
-        "method": p.airl.method,
-        "seed": p.seed,
-        "airl": msgspec.to_builtins(p.airl),
-    }
-    write_policy(job.output, trainer.policy, p.airl.ppo, {"agent": "student", **origin})
-    adversary.write_reward(job.output, origin)
+    origin = {"settings": p.settings, "method": p.airl.method, "seed": p.seed}
+    write_policy(job.output, trainer.policy, p.airl.ppo, p.env, agent="student", **origin)
+    adversary.write_reward(job.output, env=p.env, airl=p.airl, **origin)
     write_metrics(job.output, rows)
 
 

@@ -39,12 +39,19 @@ def run(job: Job) -> None:
     from irlcli.stages.policy_training import train_rounds
 
     p: Parameters = job.parameters
-    description = {"agent": "expert", "env": p.env, "settings": [p.setting], "seed": p.seed}
     settings = [parse_setting(p.env, p.setting)]
     with closing(rl.make_worlds(p.env, settings, p.ppo.n_envs, job.workers)) as worlds:
         trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed)
         rows = train_rounds(job, trainer, [p.setting])
-    write_policy(job.output, trainer.policy, p.ppo, description)
+    write_policy(
+        job.output,
+        trainer.policy,
+        p.ppo,
+        p.env,
+        agent="expert",
+        settings=(p.setting,),
+        seed=p.seed,
+    )
     write_metrics(job.output, rows)
 
 

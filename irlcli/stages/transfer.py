@@ -47,17 +47,17 @@ def run(job: Job) -> None:
     model, origin = load_reward_file(job.inputs["reward"])
     ppo = p.transfer.ppo
     horizon = environment(p.env).max_episode_steps
-    absorbing = origin["airl"]["fixed_horizon"]
+    absorbing = origin.airl.fixed_horizon
 
     def reward(rollout):
         data = rollout_transitions(rollout, slice(None), horizon)
         log_probs = torch.as_tensor(rollout.log_probs.ravel())
         g = airl.policy_reward(model, data, log_probs, "g", absorbing, ppo.gamma)
-        return (g / origin["scale"]).numpy().reshape(rollout.terminated.shape)
+        return (g / origin.scale).numpy().reshape(rollout.terminated.shape)
 
     settings = [parse_setting(p.env, p.setting)]
     with closing(rl.make_worlds(p.env, settings, ppo.n_envs, job.workers)) as worlds:
-        size, learned = worlds.observation_space.shape[0], origin["network"]["observation_size"]
+        size, learned = worlds.observation_space.shape[0], origin.network.observation_size
         if size != learned:
             raise UsageError(
                 f"the reward takes observations of size {learned}, those of {p.env} {p.setting} "
@@ -67,16 +67,18 @@ def run(job: Job) -> None:
             )
         trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed)
         rows = train_rounds(job, trainer, [p.setting], reward)
-    description = {
-        "agent": "transfer",
-        "env": p.env,
-        "settings": [p.setting],
-        "seed": p.seed,
-        "method": origin["method"],
-        "reward_seed": origin["seed"],
-        "reward_settings": origin["settings"],
-    }
-    write_policy(job.output, trainer.policy, ppo, description)
+    write_policy(
+        job.output,
+        trainer.policy,
+        ppo,
+        p.env,
+        agent="transfer",
+        settings=(p.setting,),
+        seed=p.seed,
+        method=origin.method,
+        reward_seed=origin.seed,
+        reward_settings=origin.settings,
+    )
     write_metrics(job.output, rows)
 
 

@@ -23,7 +23,6 @@ _SHA = r"[0-9a-f]{64}"
 _MAX_JSON_BYTES = 16 << 20
 # What every file system allows, so that checking a path never fails for its length.
 _MAX_PATH_BYTES = 200
-_HINT = "is this irlcli's file, and whole? `irl verify` checks a store"
 
 
 class KeyRecord(NamedTuple):
@@ -117,14 +116,14 @@ def read_json(path: Path) -> Any:
     """
     try:
         if path.is_symlink() or not path.is_file():
-            raise IntegrityError(f"{path} is missing or not a regular file", _HINT)
+            raise IntegrityError(f"{path} is missing or not a regular file")
         if path.stat().st_size > _MAX_JSON_BYTES:
-            raise IntegrityError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB", _HINT)
+            raise IntegrityError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB")
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
-        raise IntegrityError(f"{path} is not valid JSON ({error})", _HINT) from None
+        raise IntegrityError(f"{path} is not valid JSON ({error})") from None
     except OSError as error:
-        raise IntegrityError(f"{path} cannot be read ({error.strerror})", _HINT) from None
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -143,9 +142,9 @@ def read_manifest(directory: Path) -> Manifest:
         manifest = _parse_manifest(value)
         canonical = manifest.encode() == path.read_bytes()
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise IntegrityError(f"{path} is malformed ({error})", _HINT) from None
+        raise IntegrityError(f"{path} is malformed ({error})") from None
     if not canonical:
-        raise IntegrityError(f"{path} was altered: it says the same in other bytes", _HINT)
+        raise IntegrityError(f"{path} was altered: it says the same in other bytes")
     return manifest
 
 
@@ -215,13 +214,13 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
     path = directory / PROVENANCE
     value = read_json(path)
     if not isinstance(value, dict) or not isinstance(value.get("record"), dict):
-        raise IntegrityError(f"{path} is malformed", _HINT)
+        raise IntegrityError(f"{path} is malformed")
     try:
         sound = path.read_bytes() == encode_provenance(value["artefact"], value["record"])
     except (KeyError, TypeError, ValueError, RecursionError):
         sound = False
     if not sound:
-        raise IntegrityError(f"{path} was altered: its checksum does not match", _HINT)
+        raise IntegrityError(f"{path} was altered: its checksum does not match")
     if value["artefact"] != artefact_id:
-        raise IntegrityError(f"{path} belongs to another artefact", _HINT)
+        raise IntegrityError(f"{path} belongs to another artefact")
     return value["record"]

@@ -122,7 +122,15 @@ class Store:
 
     def __init__(self, root: Path | str):
         self.root = Path(root)
-        if self.root.exists() and not self.root.is_dir():
+        try:
+            present = stat.S_ISDIR(self.root.stat().st_mode)
+        except FileNotFoundError:
+            present = True
+        except OSError as error:
+            raise UsageError(
+                f"{self.root} cannot be a store ({error.strerror})", "name a directory with --store"
+            ) from None
+        if not present:
             raise UsageError(f"{self.root} is not a directory", "name a directory with --store")
         marker = self.root / "STORE"
         if marker.exists():
@@ -314,8 +322,8 @@ class Store:
         artefact = self.get(matches[0])
         return artefact if artefact.manifest.id.startswith(prefix) else None
 
-    def set_name(self, name: str, artefact: Artefact) -> None:
-        """Let ``name`` stand for ``artefact``; rewritten only if that changes something.
+    def check_name(self, name: str) -> None:
+        """Refuse what cannot be a name.
 
         Raises:
             UsageError: not a name (letters, digits, ``._-``; an id prefix is none).
@@ -326,6 +334,14 @@ class Store:
                 "a letter, then letters, digits, '.', '_', '-'; not hexadecimal digits alone, "
                 "which would read as an id",
             )
+
+    def set_name(self, name: str, artefact: Artefact) -> None:
+        """Let ``name`` stand for ``artefact``; rewritten only if that changes something.
+
+        Raises:
+            UsageError: as :meth:`check_name`.
+        """
+        self.check_name(name)
         if self.names().get(name) != artefact.id:
             write_durably(self._names() / name, artefact.id.encode() + b"\n")
 
@@ -465,7 +481,10 @@ class Store:
             # Another process may have collected it, or moved it to quarantine, meanwhile.
             if problems and (self.root / id16).is_dir():
                 damaged[id16] = Damage(problems, _recorded_command(self.root / id16))
-                self._move_to_quarantine(self.root / id16)
+                try:
+                    self._move_to_quarantine(self.root / id16)
+                except OSError as error:
+                    problems.append(f"it could not be moved to quarantine ({error.strerror})")
         return damaged
 
     def _damaged(self, directory: Path, problem: str) -> IntegrityError:

@@ -1,0 +1,132 @@
+"""What files say of themselves: rewards, policies, datasets, evaluations; checked before use.
+
+A file may come from anywhere, so nothing in it is trusted to have the right form: every
+description is validated here before a field of it is used.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from irlcli.errors import IntegrityError, UsageError
+from irlcli.interventions import environment, parse_setting
+from irlcli.settings import Activation, AIRLSettings, Discount, Finite, Method, Positive, Widths
+
+Size = Annotated[int, Meta(ge=1, le=4096)]
+Settings = Annotated[tuple[str, ...], Meta(min_length=1)]
+Agent = Literal["expert", "student", "transfer", "random", "idle"]
+
+
+class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Arguments of ``irl.networks.RewardModel``."""
+
+    observation_size: Size
+    action_size: Size
+    discrete: bool
+    state_only: bool
+    hidden: Widths
+    activation: Activation
+    gamma: Discount
+
+
+class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """``reward.json``, and the description inside ``reward.pt``.
+
+    ``scale`` is the standard deviation of g on the training data.
+    """
+
+    env: str
+    settings: Settings
+    method: Method
+    seed: int
+    airl: AIRLSettings
+    network: RewardNetwork
+    scale: Positive
+
+
+class PolicyNetwork(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
+):
+    """What ``rl.load_policy`` rebuilds a network from."""
+
+    algorithm: Literal["ppo"]
+    env: str
+    net_arch: Widths
+    activation: Activation
+    ortho_init: bool
+    normalise_observations: bool = False
+    use_sde: bool = False
+
+
+class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """``policy.json``, and the description inside ``policy.pt``.
+
+    A student's ``settings`` are those it was trained in; a transferred policy also says which
+    reward it was trained on.
+    """
+
+    agent: Agent
+    env: str
+    settings: Settings
+    seed: int
+    network: PolicyNetwork
+    method: Method | None = None
+    reward_seed: int | None = None
+    reward_settings: tuple[str, ...] | None = None
+
+
+class Dataset(Struct, frozen=True, kw_only=True):
+    """The parameters of a dataset that planning needs."""
+
+    env: str
+    settings: Settings
+
+
+class Subject(Struct, frozen=True, kw_only=True):
+    """Whom an evaluation measured."""
+
+    agent: Agent
+    env: str
+    method: Method | None = None
+
+
+class Returns(Struct, frozen=True, kw_only=True):
+    """True returns in one setting."""
+
+    setting: str
+    episodes: Annotated[int, Meta(ge=1)]
+    mean_return: Finite
+    mean_progress: Finite | None = None
+
+
+class Evaluation(Struct, frozen=True, kw_only=True):
+    """``summary.json`` of an evaluation."""
+
+    policy: Subject
+    settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
+
+
+Form = TypeVar("Form", Reward, Policy, Dataset, Evaluation)
+
+
+def parse(value: Any, form: type[Form], source: Path | str) -> Form:
+    """``value`` (JSON) as a description of ``form``, its environment and settings known ones.
+
+    Raises:
+        IntegrityError: anything else; the message names ``source``.
+    """
+    try:
+        description = msgspec.convert(value, form)
+        if isinstance(description, Evaluation):
+            env, settings = description.policy.env, [s.setting for s in description.settings]
+        else:
+            env, settings = description.env, description.settings
+        environment(env)
+        for setting in settings:
+            parse_setting(env, setting)
+    except (msgspec.ValidationError, UsageError, RecursionError) as error:
+        reason = str(error).splitlines()[0][:300]
+        raise IntegrityError(f"{source}: its description is malformed ({reason})") from None
+    return description
