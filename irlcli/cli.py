@@ -1,5 +1,6 @@
 """The command line: parse, call the runner, print. Heavy libraries load only where work is done."""
 
+import gc as garbage_collector
 import inspect
 import sys
 from collections.abc import Callable, Sequence
@@ -658,6 +659,9 @@ def build_app(arguments: Sequence[str]) -> typer.Typer:
 
 def main() -> None:
     """Entry point: exit codes and one-line errors (design: Command line)."""
+    # Most of a light command is importing, which makes no garbage; the runner switches the
+    # collector on again when there is work to do.
+    garbage_collector.disable()
     as_json = "--json" in sys.argv
     try:
         build_app(sys.argv[1:])(standalone_mode=False)

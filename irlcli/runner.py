@@ -3,6 +3,7 @@
 ``Runner(store).run(request)`` is all there is to the Python API; the command line does the same.
 """
 
+import gc
 import hashlib
 import os
 import signal
@@ -171,6 +172,7 @@ class Runner:
         return KeyRecord(request.stage.name, request.stage.version, parameters, dict(inputs))
 
     def _make(self, request: Request, record: KeyRecord, sources: Mapping[str, Source]) -> Artefact:
+        gc.enable()
         self.store.create()
 
         def on_wait(holder: str) -> None:
