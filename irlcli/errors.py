@@ -69,13 +69,18 @@ class Interrupted(IrlError):
     exit_code = 130
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
-    """A hint for a mistyped ``name``: the closest known one, or the list of all of them."""
+def closest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that a mistyped ``name`` most likely means, if one is near."""
     # Imported here: only mistakes need it, and every command imports this module.
     import difflib
 
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return close[0] if close else None
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """A hint for a mistyped ``name``: the closest known one, and all of them."""
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    if close:
-        return f"did you mean {close[0]!r}? known: {', '.join(known)}"
-    return f"known: {', '.join(known)}"
+    close = closest(name, known)
+    listed = f"known: {', '.join(known)}"
+    return f"did you mean {close!r}? {listed}" if close else listed

@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError, suggest
+from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError, closest, suggest
 from irlcli.store.digest import file_digest
 from irlcli.store.lock import is_locked, locked
 from irlcli.store.manifest import (
@@ -284,11 +284,10 @@ class Store:
         if artefact is None:
             if not inside and os.path.exists(ref):
                 return Resolved(None, Path(ref))
-            known = [*self.names(), *self.ids()]
             hint = "`irl ls` lists the artefacts"
-            close = suggest(head, known) if known else ""
-            if close.startswith("did you mean"):
-                hint = close.split(";")[0] + "; " + hint
+            close = closest(head, self.names())
+            if close is not None:
+                hint = f"did you mean {close!r}? {hint}"
             raise NotFound(f"{ref!r} names no artefact and no file", hint)
         if not rest:
             return Resolved(artefact, artefact.directory)
