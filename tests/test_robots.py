@@ -1,6 +1,7 @@
 """The PyBullet robots in the chain: continuous actions, normalisation, progress, workers, play."""
 
 import math
+import multiprocessing
 import shutil
 from types import SimpleNamespace
 
@@ -13,9 +14,10 @@ from PIL import Image
 from irlcli import envs, rl
 from irlcli.checkpoints import from_bytes, to_bytes
 from irlcli.envs.vector import VectorWorlds
-from irlcli.interventions import parse_setting, parse_settings
-from irlcli.settings import PPOSettings
-from irlcli.stages import Job
+from irlcli.errors import StageFailed
+from irlcli.interventions import environment, parse_setting, parse_settings
+from irlcli.settings import PPOSettings, load_settings
+from irlcli.stages import From, Job, collect_experts, train_airl
 from irlcli.stages.policy_training import train_rounds
 from irlcli.store import Store
 
@@ -311,3 +313,27 @@ def test_bad_input_is_one_line_and_a_hint(chains, irl, tmp_path, monkeypatch, ar
     done = irl(*arguments, "--store", chains / "1")
     assert done.code in (2, 3) and done.out == ""
     assert said in done.err and "hint:" in done.err and "Traceback" not in done.err
+
+
+def test_a_killed_worker_is_a_named_failure():
+    worlds = rl.make_worlds("reacher", SETTINGS, 2, workers=2)
+    trainer = make_trainer(worlds)
+    trainer.train_round(0)
+    (worker, *_) = multiprocessing.active_children()
+    worker.kill()
+    with pytest.raises(StageFailed, match=r"worker . .* died: signal 9"):
+        trainer.train_round(1)
+    assert not multiprocessing.active_children()
+    worlds.close()
+
+
+@pytest.mark.parametrize("env", ["ant", "half-cheetah", "reacher"])
+@pytest.mark.parametrize("profile", ["smoke", "standard", "paper"])
+def test_every_intervention_of_the_settings_can_be_learned_from(env, profile):
+    config = load_settings(env, profile)
+    assert set(config.interventions) == set(environment(env).knobs)
+    for knob, values in config.interventions.items():
+        settings = parse_settings(env, f"{knob}={','.join(values.id)}")
+        demos = collect_experts.request(env, settings, config)
+        train_airl.request(From(demos), env, settings, config.airl)
+        parse_settings(env, f"{knob}={','.join(values.ood)}")
