@@ -22,7 +22,7 @@ COMMON   = --store $(STORE) --profile $(PROFILE)
 READY   := $(VENV)/.installed
 
 .DELETE_ON_ERROR:
-.PHONY: demo test bench table1-lunar-lander clean FORCE
+.PHONY: demo test bench table1-lunar-lander figure2 clean FORCE
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -34,6 +34,7 @@ test: $(READY)
 
 bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.airl
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
 	else echo "benchmarks.bullet_step was left out: it counts instructions with valgrind"; fi
@@ -54,6 +55,23 @@ table1-lunar-lander: row-bounce row-engine-power
 	$(IRL) report returns --store $(STORE) \
 	    $(call EVALUATIONS,$(TAG),bounce,$(METHODS),$(SEEDS)) \
 	    $(call EVALUATIONS,$(TAG),engine-power,$(METHODS),$(SEEDS))
+
+# Every method on 20 gridworld datasets: the picture, the table, and how they came about.
+# SET="--set gridworld.goal=terminal" and the like make other cases, RESULTS says where they go.
+RESULTS ?= docs/results/figure2
+FIGURE2  = report figure2 --profile $(PROFILE) $(SET)
+figure2: $(READY)
+	$(RUN) $(IRL) $(FIGURE2) --store $(STORE) --name $(TAG).$(@F)
+	@mkdir -p $(RESULTS)
+	@from=$(STORE)/$$($(IRL) show --json --store $(STORE) $(TAG).$(@F) \
+	    | $(VENV)/bin/python -c 'import json, sys; print(json.load(sys.stdin)["id"][:16])') && \
+	  install -m 644 $$from/figure2.png $$from/figure2.pdf $$from/figure2.csv $(RESULTS) && \
+	  { echo '# Figure 2'; echo; \
+	    echo "\`irl $(FIGURE2)\` at commit $$(git describe --always --dirty)."; echo; \
+	    echo 'Mean over datasets, and the bootstrap 95 % interval. *Worst trained*: the worst of the'; \
+	    echo 'three settings trained on, in each dataset.'; echo; \
+	    cat $$from/figure2.md; } > $(RESULTS)/README.md
+	@echo $(RESULTS)
 
 # A row of the table: experts -> demonstrations -> AIRL per method and seed -> transfer -> returns.
 # The held-out values stand in settings/lunar-lander.toml.

@@ -38,7 +38,11 @@ _GLOBALS = {
     "torch._utils _rebuild_tensor_v2",
     *(f"torch {name}" for name in _STORAGES),
 }
-_FORMS = {"reward": descriptions.Reward, "policy": descriptions.Policy}
+_FORMS = {
+    "reward": descriptions.Reward,
+    "tabular-reward": descriptions.TabularReward,
+    "policy": descriptions.Policy,
+}
 
 
 class RefusedCode(ValueError):
@@ -89,7 +93,7 @@ def _check_globals(data: bytes) -> None:
 
 
 def save(path: Path, kind: str, description: Struct, state: dict[str, Any]) -> None:
-    """Write a tensor file of ``kind`` (``reward`` or ``policy``) that describes itself."""
+    """Write a tensor file of ``kind`` (a key of ``_FORMS``) that describes itself."""
     text = msgspec.json.encode(description, order="sorted").decode()
     path.write_bytes(
         to_bytes({"kind": kind, "schema": SCHEMA, "description": text, "state": state})

@@ -206,6 +206,67 @@ def train_airl(
     session.deliver([train_airl.request(source, env, parsed, config.airl, seed)], name)
 
 
+@command("train-maxent")
+def train_maxent(
+    session: Session,
+    demos: Annotated[str, typer.Option(help="Demonstrations in a gridworld: an artefact.")],
+    method: Annotated[str | None, typer.Option(help="erm, erm-balanced or irm.")] = None,
+    penalty: Annotated[str | None, typer.Option(help="irmv1 or closed-form.")] = None,
+    penalty_weight: Annotated[float | None, typer.Option(help="lambda of IRM.")] = None,
+    l2: Annotated[float | None, typer.Option(help="Weight decay.")] = None,
+    features: Annotated[str | None, typer.Option(help="learned or linear.")] = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Learn a reward from demonstrations in a gridworld, exactly."""
+    from irlcli.interventions import check_tabular, parse_setting
+    from irlcli.references import demonstrations
+    from irlcli.stages import train_maxent
+
+    source, env, settings = demonstrations(session.store, demos)
+    check_tabular(env, "train-maxent", wanted=True)
+    flags = {
+        "maxent.method": method,
+        "maxent.penalty": penalty,
+        "maxent.penalty_weight": penalty_weight,
+        "maxent.l2": l2,
+        "maxent.features": features,
+    }
+    config = session.settings(env, flags)
+    parsed = [parse_setting(env, text) for text in settings]
+    request = train_maxent.request(source, env, parsed, _unseen(env, config), config.maxent, seed)
+    artefacts = session.deliver([request], name)
+    if artefacts and not session.as_json:
+        _print_quality(session, artefacts[0])
+
+
+def _unseen(env: str, config: Any) -> list[Any]:
+    """Every OOD setting that the settings file names."""
+    from irlcli.interventions import parse_setting
+
+    return [
+        parse_setting(env, f"{knob}={value}")
+        for knob, values in config.interventions.items()
+        for value in values.ood
+    ]
+
+
+def _print_quality(session: Session, artefact: Any) -> None:
+    from irlcli.store import read_json
+
+    measures = ("goal_probability", "true_return", "value_difference", "rank_correlation")
+    rows = [
+        [
+            row["setting"] + ("" if row["seen"] else " (unseen)"),
+            *("-" if row[m] is None else f"{row[m]:.2f}" for m in measures),
+            f"{row['log_likelihood']:.1f}",
+        ]
+        for row in read_json(session.store.open(artefact, "quality.json"))["settings"]
+    ]
+    columns = ["setting", *(m.replace("_", " ") for m in measures), "log-likelihood"]
+    out.print_table(columns, rows, stderr=True)
+
+
 @command("transfer")
 def transfer(
     session: Session,
@@ -438,11 +499,11 @@ def _about(parameters: dict[str, Any]) -> str:
 
     Any artefact has parameters, also one that somebody made up: nothing is taken for granted.
     """
-    airl = parameters.get("airl")
+    learner = parameters.get("airl") or parameters.get("maxent")
     settings = parameters.get("settings")
     parts = [parameters.get("env"), parameters.get("agent")]
     parts += settings if isinstance(settings, list) else [parameters.get("setting")]
-    parts.append(airl.get("method") if isinstance(airl, dict) else None)
+    parts.append(learner.get("method") if isinstance(learner, dict) else None)
     parts.append(f"seed {parameters['seed']}" if "seed" in parameters else None)
     text = " ".join(str(p) for p in parts if p and p != "policy")
     return "".join(c if c.isprintable() else "?" for c in text)[:200]
@@ -576,16 +637,35 @@ def name(
         out.print_data(str(artefact.directory))
 
 
-@command("report", runs=False)
+@command("report")
 def report(
     session: Session,
-    kind: Annotated[str, typer.Argument(help="returns")],
-    refs: Annotated[list[str], typer.Argument(help="Evaluations.")],
+    kind: Annotated[str, typer.Argument(help="returns or figure2.")],
+    refs: Annotated[list[str] | None, typer.Argument(help="Evaluations, for returns.")] = None,
+    name: Name = None,
 ) -> None:
-    """Tabulate results: ``irl report returns REF...`` puts true returns side by side."""
-    if kind != "returns":
-        raise UsageError(f"unknown report {kind!r}", "known: returns")
-    _print_returns(session, refs)
+    """Put results side by side: ``irl report returns REF...``, ``irl report figure2``."""
+    if kind == "returns":
+        if not refs:
+            raise UsageError("no evaluation is named", "write irl report returns REF...")
+        _print_returns(session, refs)
+    elif kind == "figure2":
+        if refs:
+            raise UsageError("figure2 takes no references", "its seeds are --set figure2.seeds=20")
+        _report_figure2(session, name)
+    else:
+        raise UsageError(f"unknown report {kind!r}", "known: returns, figure2")
+
+
+def _report_figure2(session: Session, name: str | None) -> None:
+    from irlcli.stages import figure2
+
+    config = session.settings("gridworld")
+    settings = _settings("gridworld", config, "path-group", "id")
+    request = figure2.request("gridworld", settings, _unseen("gridworld", config), config)
+    artefacts = session.deliver([request], name)
+    if artefacts and not session.as_json:
+        print(session.store.open(artefacts[0], "figure2.md").read_text(), file=sys.stderr, end="")
 
 
 def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) -> None:

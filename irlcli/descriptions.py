@@ -12,7 +12,17 @@ from msgspec import Meta, Struct
 
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import environment, parse_setting
-from irlcli.settings import Activation, AIRLSettings, Discount, Finite, Method, Positive, Widths
+from irlcli.settings import (
+    Activation,
+    AIRLSettings,
+    Discount,
+    Finite,
+    GridworldSettings,
+    MaxEntSettings,
+    Method,
+    Positive,
+    Widths,
+)
 
 Size = Annotated[int, Meta(ge=1, le=4096)]
 Settings = Annotated[tuple[str, ...], Meta(min_length=1)]
@@ -44,6 +54,17 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     airl: AIRLSettings
     network: RewardNetwork
     scale: Positive
+
+
+class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``reward.json`` of train-maxent, and the description inside its ``reward.pt``."""
+
+    env: str
+    settings: Settings
+    method: Method
+    seed: int
+    gridworld: GridworldSettings
+    maxent: MaxEntSettings
 
 
 class PolicyNetwork(
@@ -108,7 +129,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
 
 
-Form = TypeVar("Form", Reward, Policy, Dataset, Evaluation)
+Form = TypeVar("Form", Reward, TabularReward, Policy, Dataset, Evaluation)
 
 
 def parse(value: Any, form: type[Form], source: Path | str) -> Form:

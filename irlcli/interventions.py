@@ -60,7 +60,7 @@ class Knob(NamedTuple):
     """One mechanism of an environment that can be intervened on.
 
     ``low`` and ``high`` bound every number of a value (inclusive); ``kinds`` are the forms
-    it accepts, the first being the usual one.
+    it accepts, the first being the usual one. ``whole`` admits whole numbers only.
     """
 
     argument: str
@@ -69,15 +69,20 @@ class Knob(NamedTuple):
     high: float
     default: str
     what: str
+    whole: bool = False
 
 
 class Environment(NamedTuple):
-    """What the program knows of an environment without importing it."""
+    """What the program knows of an environment without importing it.
+
+    ``tabular``: solved exactly; experts come from value iteration, rewards from train-maxent.
+    """
 
     name: str
     gym_id: str
     max_episode_steps: int
     knobs: dict[str, Knob]
+    tabular: bool = False
 
 
 _FRICTION = "tangential, torsional and rolling friction of the robot's links"
@@ -134,6 +139,20 @@ ENVIRONMENTS: dict[str, Environment] = {
         max_episode_steps=150,
         knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "1x", "of 9.8 m/s^2")},
     ),
+    "gridworld": Environment(
+        name="gridworld",
+        gym_id="irlcli/Gridworld-v0",
+        max_episode_steps=32,
+        knobs={
+            "path-group": Knob(
+                "path_group", ("absolute",), 0, 3, "0", "the open gate, 0 for no gates", whole=True
+            ),
+            "blocked": Knob(
+                "blocked", ("absolute",), 0, 2, "0", "how many groups' paths are barred", whole=True
+            ),
+        },
+        tabular=True,
+    ),
 }
 
 
@@ -162,6 +181,22 @@ def environment(name: str) -> Environment:
     if name not in ENVIRONMENTS:
         raise UsageError(f"unknown environment {name!r}", suggest(name, ENVIRONMENTS))
     return ENVIRONMENTS[name]
+
+
+def check_tabular(env: str, stage: str, wanted: bool) -> None:
+    """Refuse an environment that ``stage`` cannot work on.
+
+    Raises:
+        UsageError: unknown, or tabular where ``wanted`` is false, or the other way round.
+    """
+    if environment(env).tabular == wanted:
+        return
+    fit = ", ".join(e.name for e in ENVIRONMENTS.values() if e.tabular == wanted)
+    raise UsageError(
+        f"{stage} does not work on {env}: it is {'no' if wanted else 'a'} tabular environment",
+        f"{stage} takes {fit}; rewards of {env} come from "
+        f"`irl {'train-airl' if wanted else 'train-maxent'}`",
+    )
 
 
 def knob_of(env: str, knob: str) -> Knob:
@@ -204,6 +239,11 @@ def parse_value(env: str, knob: str, text: str) -> Value:
             raise UsageError(
                 f"{knob}={text.strip()!r}: the range is empty",
                 f"write the smaller end first: {_format(numbers[1])}..{_format(numbers[0])}",
+            )
+        if spec.whole and not all(x.is_integer() for x in numbers):
+            raise UsageError(
+                f"{knob}={text.strip()!r} is no whole number",
+                f"{knob} ({spec.what}) is one of {_format(spec.low)} to {_format(spec.high)}",
             )
         for x in numbers:
             if not math.isfinite(x) or not spec.low <= x <= spec.high:

@@ -38,6 +38,11 @@ def tensor_file(
             raise NotFound(f"{resolved.path} holds no {kind}.pt", f"name a {kind} file")
         description, _ = load(path, kind)
         return source_of(Resolved(None, path)), description
+    if artefact.manifest.record.stage == "train-maxent":
+        raise UsageError(
+            f"{ref!r} is a tabular-reward, not a {kind}",
+            "policies are not trained on it: its quality.json says what it is worth",
+        )
     output = resolved.output or _only(artefact, f"{kind}.pt")
     if output != f"{kind}.pt":
         raise UsageError(

@@ -129,6 +129,51 @@ class EvaluationSettings(Struct, frozen=True, kw_only=True, forbid_unknown_field
     deterministic: bool = False
 
 
+class GridworldSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The gridworld of paper Sec. 5.1. Part of a dataset's identity, and recorded with it.
+
+    ``horizon`` [steps] is that of experts and learner. At the goal an episode ends
+    (``terminal``) or stays to the horizon (``absorbing``).
+    """
+
+    size: Annotated[int, Meta(ge=5, le=1024)] = 8
+    horizon: Count = 32
+    goal: Literal["terminal", "absorbing"] = "absorbing"
+    p_slip: Annotated[float, Meta(ge=0, lt=1)] = 0.2
+
+
+class MaxEntSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Tractable maximum-entropy IRL (paper Sec. 4.2, 5.1, App. A, C).
+
+    The reward is an MLP's scalar output (``features = learned``) or linear in the ``inputs`` of
+    a state. ``held_out`` episodes of each setting's expert measure the likelihood.
+    """
+
+    method: Method = "erm"
+    penalty: Literal["irmv1", "closed-form"] = "irmv1"
+    penalty_weight: NonNegative = 0.05
+    l2: NonNegative = 0.0
+    features: Literal["learned", "linear"] = "learned"
+    inputs: Literal["one-hot", "coordinates"] = "one-hot"
+    hidden: Count = 32
+    iterations: Count = 1000
+    learning_rate: Positive = 1e-3
+    held_out: Count = 200
+
+
+class Figure2Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Paper Fig. 2 as numbers: ``seeds`` datasets, the lambdas of IRM, the L2 weights of ERM.
+
+    The datasets' seeds begin at 1000: smaller ones are for trying things out.
+    """
+
+    seeds: Annotated[int, Meta(ge=2)] = 20
+    first_seed: NonNegativeCount = 1000
+    episodes: tuple[Count, ...] = (400, 25, 3)
+    penalty_weights: tuple[NonNegative, ...] = (0.01, 0.05, 0.2, 1.0)
+    l2s: tuple[NonNegative, ...] = (1e-3, 1e-2, 1e-1, 1.0)
+
+
 class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Everything that can be set for one environment."""
 
@@ -138,6 +183,9 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     airl: AIRLSettings = AIRLSettings()
     transfer: TransferSettings = TransferSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
+    gridworld: GridworldSettings = GridworldSettings()
+    maxent: MaxEntSettings = MaxEntSettings()
+    figure2: Figure2Settings = Figure2Settings()
 
 
 def load_settings(

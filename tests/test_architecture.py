@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "irlcli"
-HEAVY = {"torch", "stable_baselines3", "gymnasium", "pybullet", "pandas", "pyarrow", "Box2D"}
+HEAVY = {
+    *("torch", "stable_baselines3", "gymnasium", "pybullet", "pandas", "pyarrow", "Box2D"),
+    *("scipy", "matplotlib"),
+}
 OURS = {
     "store",
     "stages",
@@ -31,7 +34,7 @@ NEVER = {
     "interventions": HEAVY | OURS | {"numpy", "settings"},
     "trajectories": HEAVY | OURS | {"settings", "pathlib"},
     "play": {"store", "irl", "stages", "cli", "console", "runner", "stable_baselines3"},
-    "tabular": HEAVY | OURS | {"settings", "pathlib"},
+    "tabular": (HEAVY - {"scipy"}) | OURS | {"settings", "pathlib"},
     "store": HEAVY | (OURS - {"store"}) | {"numpy", "msgspec", "settings", "trajectories"},
     "envs": {"torch", "stable_baselines3", "pandas", "pyarrow"} | (OURS - {"envs"}),
     "irl": {"stable_baselines3", "gymnasium", "pandas", "pyarrow", "logging", "pathlib"}
@@ -57,6 +60,9 @@ LIGHT = [
     "stages/train_expert",
     "stages/collect_experts",
     "stages/train_airl",
+    "stages/train_maxent",
+    "stages/sweep_maxent",
+    "stages/figure2",
     "stages/transfer",
     "stages/evaluate",
 ]

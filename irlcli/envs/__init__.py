@@ -15,6 +15,7 @@ _ENTRY_POINTS = {
     "ant": "irlcli.envs.bullet.ant:Ant",
     "half-cheetah": "irlcli.envs.bullet.half_cheetah:HalfCheetah",
     "reacher": "irlcli.envs.bullet.reacher:Reacher",
+    "gridworld": "irlcli.envs.gridworld:Gridworld",
 }
 
 for _name, _entry_point in _ENTRY_POINTS.items():

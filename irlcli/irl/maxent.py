@@ -10,8 +10,9 @@ Arrays in, arrays out. A trajectory has H actions and H + 1 states, each of whic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -334,6 +335,8 @@ def fit(
     iterations: int = 2000,
     learning_rate: float = 1e-3,
     record_every: int = 50,
+    state: Mapping[str, Any] | None = None,
+    after_record: Callable[[int, Callable[[], dict[str, Any]]], None] | None = None,
 ) -> Fit:
     """Fit R rewards at once (paper Eq. 8), each minimising
 
@@ -353,6 +356,8 @@ def fit(
         penalty_kind: ``irmv1`` or ``closed-form``.
         hidden: width of the hidden layer; 0 learns psi of r = psi^T features.
         record_every: iterations between two records of the fit's progress.
+        state: where an equal call was when ``after_record`` got it, to go on from there.
+        after_record: called with the iterations done, and what gives the state then.
 
     Raises:
         ValueError: shapes that do not fit; weights, penalty weights or l2 negative or NaN; a
@@ -387,7 +392,22 @@ def fit(
     optimizer = torch.optim.RMSprop(networks.parameters(), lr=learning_rate)
     records = []
     solution = None
-    for i in range(iterations):
+    done = 0
+    if state is not None:
+        done = state["iterations"]
+        networks.load_state_dict(state["networks"])
+        optimizer.load_state_dict(state["optimizer"])
+        records = [(i, *(a.numpy() for a in arrays)) for i, *arrays in state["records"]]
+
+    def snapshot() -> dict[str, Any]:
+        return {
+            "iterations": done,
+            "networks": networks.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "records": [(i, *map(torch.as_tensor, arrays)) for i, *arrays in records],
+        }
+
+    for i in range(done, iterations):
         reward = networks(inputs)
         phi = reward.detach().numpy()
         solution = solve(settings, phi, horizon, discount, reuse=solution)
@@ -401,6 +421,9 @@ def fit(
         for parameter in networks.parameters():
             parameter.grad += decay * parameter.detach()
         optimizer.step()
+        done = i + 1
+        if after_record is not None and records[-1][0] == i:
+            after_record(done, snapshot)
     with torch.no_grad():
         phi = networks(inputs).numpy()
     steps, objectives, penalties, gaps = zip(*records, strict=True)

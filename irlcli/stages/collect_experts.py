@@ -1,13 +1,14 @@
 """Demonstrations of each setting's own expert, as one Parquet dataset."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, parse_setting
-from irlcli.settings import Settings
-from irlcli.stages import From, Job, Request, Stage, train_expert
+from irlcli.interventions import Setting, environment, parse_setting
+from irlcli.settings import GridworldSettings, Settings
+from irlcli.stages import Console, From, Job, Request, Stage, train_expert
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -19,6 +20,17 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     deterministic: bool
     seed: int
     bar: float | None
+
+
+class TabularParameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a gridworld's dataset depends on: its experts are part of the computation."""
+
+    env: str
+    settings: tuple[str, ...]
+    episodes: tuple[int, ...]
+    seed: int
+    bar: float | None
+    gridworld: GridworldSettings
 
 
 def request(
@@ -43,20 +55,20 @@ def request(
             f"{len(counts)} episode counts for {len(settings_)} settings",
             "give one count for all settings or one for each, all at least 1",
         )
+    texts = tuple(str(s) for s in settings_)
+    label = f"collect-experts {env} {', '.join(texts)} seed {seed}"
+    shared = {"env": env, "settings": texts, "episodes": counts, "seed": seed}
+    if environment(env).tabular:
+        tabular = TabularParameters(**shared, bar=config.expert.bar, gridworld=config.gridworld)
+        return Request(TABULAR_STAGE, tabular, {}, label)
     parameters = Parameters(
-        env=env,
-        settings=tuple(str(s) for s in settings_),
-        episodes=counts,
-        deterministic=config.demonstrations.deterministic,
-        seed=seed,
-        bar=config.expert.bar,
+        **shared, deterministic=config.demonstrations.deterministic, bar=config.expert.bar
     )
     # Experts do not depend on the seed of the sampling: every dataset shares them.
     experts = {
         f"expert {s}": From(train_expert.request(env, s, 0, config.expert), "policy.pt")
         for s in settings_
     }
-    label = f"collect-experts {env} {', '.join(parameters.settings)} seed {seed}"
     return Request(STAGE, parameters, experts, label)
 
 
@@ -77,29 +89,10 @@ def run(job: Job) -> None:
         policy, _ = load_policy_file(job.inputs[f"expert {text}"])
         seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
         trajectories = rl.roll_out(p.env, setting, policy, episodes, seed, p.deterministic)
-        returns = np.array([t.episode_return for t in trajectories])
         warn_of_errors(job, text, trajectories)
-        met = None if p.bar is None else bool(returns.mean() >= p.bar)
-        if met is False:
-            job.console.warn(
-                f"the expert of {p.env} {text} misses its bar: mean true return "
-                f"{returns.mean():.0f} over {episodes} episodes, bar {p.bar:.0f}"
-            )
-        progress = float(np.mean([t.progress for t in trajectories]))
         groups.append((setting, trajectories))
-        summary.append(
-            {
-                "setting": text,
-                "episodes": episodes,
-                "mean_return": float(returns.mean()),
-                "std_return": float(returns.std()),
-                "mean_progress": None if np.isnan(progress) else progress,
-                "mean_length": float(np.mean([len(t) for t in trajectories])),
-                "bar": p.bar,
-                "bar_met": met,
-            }
-        )
-        facts = {text: shown(returns.mean(), progress)}
+        summary.append(_summary(p.env, text, trajectories, p.bar, job.console))
+        facts = {text: shown(summary[-1]["mean_return"], summary[-1]["mean_progress"])}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {
         "experts": {text: file_digest(job.inputs[f"expert {text}"]) for text in p.settings},
@@ -109,4 +102,50 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", {"env": p.env, "settings": summary})
 
 
+def run_tabular(job: Job) -> None:
+    """Sample the policy that value iteration finds in each setting, ties broken at random."""
+    from irlcli.dataset import write_demonstrations
+    from irlcli.stages import gridworlds
+    from irlcli.stages.outputs import write_json
+
+    p: TabularParameters = job.parameters
+    groups, summary = [], []
+    for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True)):
+        trajectories = gridworlds.sample(text, p.gridworld, episodes, (p.seed, index))
+        groups.append((parse_setting(p.env, text), trajectories))
+        summary.append(_summary(p.env, text, trajectories, p.bar, job.console))
+        facts = {text: f"return {summary[-1]['mean_return']:.0f}"}
+        job.console.progress(index + 1, len(p.settings), "settings", facts)
+    metadata = {"experts": "value iteration", "gridworld": msgspec.to_builtins(p.gridworld)}
+    write_demonstrations(job.output, p.env, groups, metadata)
+    write_json(job.output / "summary.json", {"env": p.env, "settings": summary})
+
+
+def _summary(
+    env: str, text: str, trajectories: Sequence[Any], bar: float | None, console: Console
+) -> dict[str, Any]:
+    """One setting's expert in numbers; warns if it misses its bar."""
+    import numpy as np
+
+    returns = np.array([t.episode_return for t in trajectories])
+    progress = float(np.mean([t.progress for t in trajectories]))
+    met = None if bar is None else bool(returns.mean() >= bar)
+    if met is False:
+        console.warn(
+            f"the expert of {env} {text} misses its bar: mean true return "
+            f"{returns.mean():.0f} over {len(returns)} episodes, bar {bar:.0f}"
+        )
+    return {
+        "setting": text,
+        "episodes": len(returns),
+        "mean_return": float(returns.mean()),
+        "std_return": float(returns.std()),
+        "mean_progress": None if np.isnan(progress) else progress,
+        "mean_length": float(np.mean([len(t) for t in trajectories])),
+        "bar": bar,
+        "bar_met": met,
+    }
+
+
 STAGE = Stage("collect-experts", 1, run)
+TABULAR_STAGE = Stage("collect-experts", 1, run_tabular)

@@ -5,7 +5,7 @@ from typing import Literal
 
 import msgspec
 
-from irlcli.interventions import Setting, parse_setting
+from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.settings import EvaluationSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
@@ -33,7 +33,11 @@ def request(
     """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``settings_``.
 
     Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
+
+    Raises:
+        UsageError: a tabular environment.
     """
+    check_tabular(env, "evaluate", wanted=False)
     texts = tuple(str(s) for s in settings_)
     parameters = Parameters(env=env, settings=texts, agent=agent, seed=seed, evaluation=evaluation)
     inputs = {} if policy is None else {"policy": policy}

@@ -31,9 +31,9 @@ def warn_of_errors(job: Job, setting: str, trajectories: Sequence[Trajectory]) -
             job.console.warn(f"{setting}, episode {k}: {trajectory.error}; it ended there")
 
 
-def shown(true_return: float, progress: float) -> str:
-    """A true return as progress shows it, with the environment's progress if that is measured."""
-    measured = "" if math.isnan(progress) else f" progress {progress:.0f}"
+def shown(true_return: float, progress: float | None) -> str:
+    """A true return for the person who waits, with the environment's progress if it has one."""
+    measured = "" if progress is None or math.isnan(progress) else f" progress {progress:.0f}"
     return f"return {true_return:.0f}{measured}"
 
 

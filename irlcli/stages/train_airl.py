@@ -6,7 +6,7 @@ from contextlib import closing
 import msgspec
 
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.interventions import Setting, parse_setting
+from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.settings import AIRLSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
@@ -33,8 +33,9 @@ def request(
     ``metrics.parquet`` with one row per round and setting.
 
     Raises:
-        UsageError: the worlds cannot be shared equally by the settings, or gSDE is asked for.
+        UsageError: a tabular environment, gSDE, or worlds that the settings cannot share equally.
     """
+    check_tabular(env, "train-airl", wanted=False)
     if airl.ppo.use_sde:
         raise UsageError(
             "airl.ppo.use_sde: AIRL needs log pi(a|s) of the action taken, and gSDE's noise "

@@ -4,7 +4,7 @@ from contextlib import closing
 
 import msgspec
 
-from irlcli.interventions import Setting
+from irlcli.interventions import Setting, check_tabular
 from irlcli.settings import ExpertSettings, PPOSettings
 from irlcli.stages import Job, Request, Stage
 
@@ -20,7 +20,12 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def request(env: str, setting: Setting, seed: int, expert: ExpertSettings) -> Request:
-    """The expert of ``setting``: outputs ``policy.pt``, ``policy.json``, ``metrics.parquet``."""
+    """The expert of ``setting``: outputs ``policy.pt``, ``policy.json``, ``metrics.parquet``.
+
+    Raises:
+        UsageError: a tabular environment.
+    """
+    check_tabular(env, "train-expert", wanted=False)
     parameters = Parameters(
         env=env,
         setting=str(setting),

@@ -5,7 +5,7 @@ from contextlib import closing
 import msgspec
 
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, parse_setting
+from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.settings import TransferSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
@@ -25,7 +25,11 @@ def request(
     """A policy trained on ``reward`` (a ``reward.pt``) in ``setting``.
 
     Outputs ``policy.pt``, ``policy.json`` and ``metrics.parquet``.
+
+    Raises:
+        UsageError: a tabular environment.
     """
+    check_tabular(env, "transfer", wanted=False)
     parameters = Parameters(env=env, setting=str(setting), seed=seed, transfer=transfer)
     label = f"transfer {env} {setting} seed {seed}"
     return Request(STAGE, parameters, {"reward": reward}, label)

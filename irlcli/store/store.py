@@ -215,15 +215,18 @@ class Store:
         Raises:
             IntegrityError: the manifest is damaged; the artefact has been moved to quarantine.
         """
-        directory = self.root / id16
         try:
-            manifest = read_manifest(directory)
+            return self._read(id16)
         except NewerFormat:
             raise
         except IntegrityError as error:
-            raise self._damaged(directory, error.message) from None
+            raise self._damaged(self.root / id16, error.message) from None
+
+    def _read(self, id16: str) -> Artefact:
+        directory = self.root / id16
+        manifest = read_manifest(directory)
         if manifest.id[:_ID_DIGITS] != id16:
-            raise self._damaged(directory, "its manifest does not match its address")
+            raise IntegrityError(f"{directory / MANIFEST} does not match its address")
         return Artefact(directory, manifest)
 
     def open(self, artefact: Artefact, path: str) -> Path:
@@ -441,15 +444,12 @@ class Store:
         Raises:
             NewerFormat: a newer version made it; nothing can be said of it.
         """
-        directory = self.root / id16
         try:
-            manifest = read_manifest(directory)
+            directory, manifest = self._read(id16)
         except NewerFormat:
             raise
         except IntegrityError as error:
             return [error.message]
-        if manifest.id[:_ID_DIGITS] != id16:
-            return [f"{directory / MANIFEST} does not match its address"]
         found = [
             problem
             for output in manifest.outputs

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 import torch
@@ -249,6 +251,27 @@ def test_fit_improves_the_likelihood_and_runs_do_not_affect_each_other():
             **shared,
         )  # fmt: skip
         assert np.allclose(alone.reward[0], both.reward[r], atol=1e-9)
+
+
+def test_a_fit_that_goes_on_from_a_state_ends_the_same_to_the_bit():
+    settings = stack([gridworld(5, path_group=g, goal="absorbing") for g in PATH_GROUPS])
+    rest = (soft_experts(settings, 6, 12), np.full((1, 3), 1 / 3), np.array([0.01]), np.zeros(1))
+    shared = {"penalty_kind": "closed-form", "horizon": 12, "iterations": 25, "record_every": 10}
+    states = []
+
+    def keep(done, state):
+        buffer = io.BytesIO()
+        torch.save(state(), buffer)
+        states.append((done, buffer.getvalue()))
+
+    whole = fit(settings, np.eye(25), *rest, [0], **shared, after_record=keep)
+    assert [done for done, _ in states] == [1, 11, 21, 25]
+    for _, data in states:
+        state = torch.load(io.BytesIO(data), weights_only=True)
+        again = fit(settings, np.eye(25), *rest, [0], **shared, state=state)
+        assert np.array_equal(again.reward, whole.reward)
+        for name in ("iterations", "objective", "penalty", "gap"):
+            assert np.array_equal(getattr(again, name), getattr(whole, name))
 
 
 def test_l2_and_the_penalty_change_the_fit():

@@ -1,0 +1,282 @@
+"""Paper Fig. 2: recovered rewards as pictures, and beside them what they are worth.
+
+A picture of one dataset's reward persuades easily; the table and the curves are over all datasets,
+with bootstrap 95 % intervals. The dataset is the unit of the statistics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+
+MEASURES = (
+    "goal_probability",
+    "true_return",
+    "value_difference",
+    "rank_correlation",
+    "log_likelihood",
+)
+_RESAMPLES = 10_000
+# Okabe and Ito's colours, told apart by colour-blind readers too.
+GROUP_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
+
+
+def bootstrap_interval(sample: np.ndarray, seed: int = 0) -> tuple[float, float]:
+    """95 % percentile interval of the mean of ``sample`` [n]."""
+    rng = np.random.default_rng(seed)
+    means = sample[rng.integers(len(sample), size=(_RESAMPLES, len(sample)))].mean(1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def summary(quality: pd.DataFrame) -> pd.DataFrame:
+    """Mean and interval over seeds of each measure, per variant and setting.
+
+    ``worst`` stands for the worst of the settings trained on, seed by seed. A rank correlation
+    that does not exist (a constant value) counts as 0: such a reward ranks nothing.
+    """
+    filled = quality.fillna({"rank_correlation": 0.0})
+    worst = filled[filled["seen"]].copy()
+    worst["value_difference"] *= -1.0
+    worst = worst.groupby(["variant", "seed"], sort=False)[list(MEASURES)].min().reset_index()
+    worst["value_difference"] *= -1.0
+    both = pd.concat([filled, worst.assign(setting="worst", seen=True)])
+    rows = []
+    for (variant, setting), group in both.groupby(["variant", "setting"], sort=False):
+        for measure in MEASURES:
+            sample = group[measure].to_numpy()
+            low, high = bootstrap_interval(sample)
+            rows.append(
+                {
+                    "variant": variant,
+                    "setting": setting,
+                    "seen": bool(group["seen"].iloc[0]),
+                    "measure": measure,
+                    "mean": float(sample.mean()),
+                    "low": low,
+                    "high": high,
+                    "datasets": len(sample),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def table(found: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows, a row per variant: ``mean [low, high]`` over datasets."""
+    wanted = [("goal probability, worst trained", "goal_probability", "worst", 2)]
+    wanted += [(f"goal probability, {u}", "goal_probability", u, 2) for u in unseen]
+    wanted += [(f"true return, {u}", "true_return", u, 1) for u in unseen]
+    wanted += [(f"value difference, {u}", "value_difference", u, 1) for u in unseen]
+    wanted += [("log-likelihood, worst trained", "log_likelihood", "worst", 1)]
+    wanted += [(f"rank correlation, {u}", "rank_correlation", u, 2) for u in unseen]
+    cells = found.set_index(["variant", "measure", "setting"])
+    rows = []
+    for variant in dict.fromkeys(found["variant"]):
+        row = [variant]
+        for _, measure, setting, digits in wanted:
+            c = cells.loc[(variant, measure, setting)]
+            row.append(f"{c['mean']:.{digits}f} [{c['low']:.{digits}f}, {c['high']:.{digits}f}]")
+        rows.append(row)
+    return ["method", *(w[0] for w in wanted)], rows
+
+
+def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:
+    """(weight, variant) along each sweep, from weight 0: IRM by penalty, and the L2 of ERM."""
+    rows = quality.drop_duplicates("variant")
+    irm = rows[(rows["method"] == "irm") & ~rows["shuffled"]]
+    found = {
+        f"IRM {penalty}": [
+            (0.0, "erm-balanced"),
+            *zip(group["penalty_weight"], group["variant"], strict=True),
+        ]
+        for penalty, group in irm.groupby("penalty", sort=False)
+    }
+    erm = rows[rows["method"] == "erm"]
+    return {**found, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
+
+
+def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One recovered reward: [S], and the routes [T + 1] of its optimal policy by setting."""
+
+    title: str
+    reward: np.ndarray
+    routes: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Maze:
+    """What the panels are drawn on.
+
+    Attributes:
+        size: cells a side.
+        paths: for each setting trained on, the experts' trajectories of state indices.
+        gates: for each setting trained on, its walls [S] bool.
+        bars: for each unseen setting, its walls [S] bool.
+    """
+
+    size: int
+    paths: Mapping[str, Sequence[np.ndarray]]
+    gates: Mapping[str, np.ndarray]
+    bars: Mapping[str, np.ndarray]
+
+
+def draw(
+    directory: Path,
+    maze: Maze,
+    panels: Sequence[Panel],
+    found: pd.DataFrame,
+    lines: Mapping[str, Sequence[tuple[float, str]]],
+    seed: int,
+) -> None:
+    """Write ``figure2.png`` and ``figure2.pdf``.
+
+    Args:
+        panels: seven, beside the experts' paths.
+        found: as :func:`summary` returns it.
+        lines: as :func:`curves` returns them.
+        seed: the dataset that the panels show.
+    """
+    caption = (
+        f"Dataset {seed}, not chosen for its looks. (b)-(h): the recovered reward of each cell, on "
+        "its own colour scale. White crosses: the bars of the unseen mazes\n(blocked=1 the left "
+        "one, blocked=2 both). Orange: where the reward's optimal policy goes in blocked=1 (solid) "
+        "and blocked=2 (dotted) if no move slips; a dot where it ends.\nCurves and table: means "
+        f"over {found['datasets'].iloc[0]} datasets, with bootstrap 95 % intervals."
+    )
+    with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
+        figure = plt.figure(figsize=(15, 16), layout="constrained")
+        figure.suptitle(caption, fontsize=10)
+        grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 5.4])
+        tops = [grid[i].subgridspec(1, 4) for i in range(2)]
+        axes = [figure.add_subplot(tops[k // 4][k % 4]) for k in range(8)]
+        _draw_experts(axes[0], maze)
+        for k, (axis, panel) in enumerate(zip(axes[1:], panels, strict=True)):
+            _draw_reward(figure, axis, maze, panel, chr(ord("b") + k))
+        _draw_curves(figure, grid[2].subgridspec(1, 3), found, lines, list(maze.bars))
+        _draw_table(figure.add_subplot(grid[3]), found, list(maze.bars))
+        figure.savefig(directory / "figure2.png", dpi=130)
+        figure.savefig(directory / "figure2.pdf", metadata={"CreationDate": None})
+        plt.close(figure)
+
+
+def _frame(axis, size: int) -> None:
+    axis.set(xlim=(-0.5, size - 0.5), ylim=(-0.5, size - 0.5), aspect="equal", xticks=[], yticks=[])
+
+
+def _cells(axis, wall: np.ndarray, size: int, **style) -> None:
+    for cell in np.flatnonzero(wall):
+        axis.add_patch(Rectangle((cell % size - 0.5, cell // size - 0.5), 1, 1, **style))
+
+
+def _ends(axis, size: int, colour: str) -> None:
+    for position, text in ((0, "S"), (size - 1, "G")):
+        axis.text(
+            *(position, position, text),
+            **{"ha": "center", "va": "center", "size": 12, "weight": "bold", "color": colour},
+            path_effects=[
+                withStroke(linewidth=2.5, foreground="black" if colour == "white" else "white")
+            ],
+            zorder=5,
+        )
+
+
+def _draw_experts(axis, maze: Maze) -> None:
+    size = maze.size
+    rng = np.random.default_rng(0)
+    closed_to_all = np.logical_and.reduce(list(maze.gates.values()))
+    some = np.logical_or.reduce(list(maze.gates.values())) & ~closed_to_all
+    _cells(axis, closed_to_all, size, facecolor="0.35", edgecolor="none")
+    _cells(axis, some, size, facecolor="0.85", edgecolor="0.35", hatch="///", linewidth=0.5)
+    for colour, (setting, paths) in zip(GROUP_COLOURS, maze.paths.items(), strict=False):
+        for path in paths[:25]:
+            jitter = rng.normal(0, 0.07, (2, len(path)))
+            axis.plot(
+                path % size + jitter[0], path // size + jitter[1], color=colour, lw=0.8, alpha=0.5
+            )
+        axis.plot([], [], color=colour, lw=2, label=f"{setting}: {len(paths)}")
+    axis.legend(loc="lower right", fontsize=7.5, framealpha=0.9)
+    _ends(axis, size, "black")
+    _frame(axis, size)
+    axis.set_title(
+        "(a) experts' paths (at most 25 a group);\nhatched: gates, each open to one group"
+    )
+
+
+def _draw_reward(figure, axis, maze: Maze, panel: Panel, letter: str) -> None:
+    size = maze.size
+    image = axis.imshow(
+        panel.reward.reshape(size, size), origin="lower", cmap="viridis", interpolation="nearest"
+    )
+    figure.colorbar(image, ax=axis, shrink=0.82, pad=0.02)
+    bars = np.logical_or.reduce(list(maze.bars.values()))
+    _cells(axis, bars, size, facecolor="none", edgecolor="white", hatch="xxx", linewidth=0.8)
+    for style, (setting, route) in zip(("-", ":"), panel.routes.items(), strict=False):
+        axis.plot(route % size, route // size, style, color="#D55E00", lw=2.5, label=setting)
+        axis.plot(route[-1] % size, route[-1] // size, "o", color="#D55E00", ms=6)
+    _ends(axis, size, "white")
+    _frame(axis, size)
+    axis.set_title(f"({letter}) {panel.title}")
+
+
+def _draw_curves(figure, places, found, lines, unseen: Sequence[str]) -> None:
+    cells = found.set_index(["variant", "measure", "setting"])
+    what = [(f"goal probability, {u} (unseen)", "goal_probability", u) for u in unseen[:2]]
+    what.append(("log-likelihood, worst trained setting [nats]", "log_likelihood", "worst"))
+    for k, (title, measure, setting) in enumerate(what):
+        axis = figure.add_subplot(places[k])
+        for colour, marker, (label, points) in zip(
+            GROUP_COLOURS, "os^", lines.items(), strict=False
+        ):
+            weights = [weight for weight, _ in points]
+            rows = cells.loc[[(variant, measure, setting) for _, variant in points]]
+            axis.fill_between(weights, rows["low"], rows["high"], color=colour, alpha=0.2, lw=0)
+            axis.plot(weights, rows["mean"], marker=marker, color=colour, label=label)
+        axis.set_xscale("symlog", linthresh=1e-3)
+        axis.set_xlim(left=-1e-4)
+        axis.set(title=title, xlabel="$\\lambda$ of IRM (0: ERM-balanced), or L2 of ERM (0: ERM)")
+        axis.grid(alpha=0.3)
+        if measure == "goal_probability":
+            axis.set_ylim(-0.03, 1.03)
+        if k == 0:
+            axis.legend(fontsize=8)
+
+
+def _draw_table(axis, found: pd.DataFrame, unseen: Sequence[str]) -> None:
+    columns, rows = table(found, unseen)
+    keep = [i for i, c in enumerate(columns) if not c.startswith("value difference")]
+    axis.axis("off")
+    drawn = axis.table(
+        [[columns[i].replace(", ", ",\n") for i in keep]]
+        + [[row[i] for i in keep] for row in rows],
+        colWidths=[0.16] + [0.84 / (len(keep) - 1)] * (len(keep) - 1),
+        cellLoc="center",
+        bbox=[0, 0, 1, 1],
+        edges="horizontal",
+    )
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(9)
+    for (row, column), cell in drawn.get_celld().items():
+        cell.set_linewidth(0.4)
+        if column == 0:
+            cell.set_text_props(ha="left")
+        if row == 0:
+            cell.set_height(1.8 * cell.get_height())
+            cell.set_text_props(weight="bold", size=8)

@@ -1,0 +1,66 @@
+"""Figure 2's statistics against numbers worked out by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from irlcli.report.figure2 import MEASURES, bootstrap_interval, curves, markdown, summary, table
+
+
+def quality(variant, setting, seen, values, **more):
+    """A row per dataset; every measure has the same value."""
+    given = {"method": "erm", "penalty": "irmv1", "penalty_weight": 0.0, "l2": 0.0} | more
+    return [
+        {"variant": variant, "shuffled": False, **given, "seed": seed, "setting": setting}
+        | {"seen": seen, **dict.fromkeys(MEASURES, value)}
+        for seed, value in enumerate(values)
+    ]
+
+
+def test_interval_is_that_of_a_normal_mean():
+    sample = np.random.default_rng(1).normal(3.0, 2.0, 400)
+    low, high = bootstrap_interval(sample)
+    error = 1.96 * sample.std() / 20
+    assert low == pytest.approx(sample.mean() - error, abs=0.02)
+    assert high == pytest.approx(sample.mean() + error, abs=0.02)
+    assert bootstrap_interval(np.full(5, 7.0)) == (7.0, 7.0)
+
+
+def test_worst_is_taken_within_each_dataset_and_among_trained_settings():
+    rows = quality("erm", "a", True, [1.0, 4.0]) + quality("erm", "b", True, [3.0, 2.0])
+    rows += quality("erm", "c", False, [-9.0, -9.0])
+    found = summary(pd.DataFrame(rows)).set_index(["setting", "measure"])["mean"]
+    assert found["worst", "goal_probability"] == 1.5
+    assert found["worst", "value_difference"] == 3.5  # the larger, the worse
+    assert found["a", "true_return"] == 2.5
+    assert found["c", "log_likelihood"] == -9.0
+
+
+def test_a_reward_that_ranks_nothing_counts_as_zero():
+    found = summary(pd.DataFrame(quality("erm", "a", True, [np.nan, 1.0])))
+    means = found.set_index(["setting", "measure"])["mean"]
+    assert means["a", "rank_correlation"] == 0.5
+
+
+def test_table_has_a_row_a_variant():
+    rows = quality("erm", "a", True, [1.0, 1.0]) + quality("erm", "c", False, [0.25, 0.25])
+    columns, body = table(summary(pd.DataFrame(rows)), ["c"])
+    assert columns[:3] == ["method", "goal probability, worst trained", "goal probability, c"]
+    assert body[0][:3] == ["erm", "1.00 [1.00, 1.00]", "0.25 [0.25, 0.25]"]
+    assert markdown(columns[:2], [r[:2] for r in body]).splitlines() == [
+        "| method | goal probability, worst trained |",
+        "| --- | --- |",
+        "| erm | 1.00 [1.00, 1.00] |",
+    ]
+
+
+def test_curves_start_at_weight_zero_and_leave_the_control_out():
+    rows = quality("erm", "a", True, [1.0]) + quality("erm l2 0.1", "a", True, [1.0], l2=0.1)
+    rows += quality("erm-balanced", "a", True, [1.0], method="erm-balanced")
+    irm = {"method": "irm", "penalty": "closed-form", "penalty_weight": 0.05}
+    rows += quality("irm closed-form 0.05", "a", True, [1.0], **irm)
+    rows += quality("irm closed-form 0.05 shuffled", "a", True, [1.0], **irm, shuffled=True)
+    assert curves(pd.DataFrame(rows)) == {
+        "IRM closed-form": [(0.0, "erm-balanced"), (0.05, "irm closed-form 0.05")],
+        "ERM + L2": [(0.0, "erm"), (0.1, "erm l2 0.1")],
+    }

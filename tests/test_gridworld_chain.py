@@ -1,0 +1,251 @@
+"""The gridworld end to end, through the real command line at the smoke profile."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import pyarrow.parquet as pq
+import pytest
+from test_architecture import loaded_by
+
+from irlcli import checkpoints
+from irlcli.dataset import read_demonstrations
+from irlcli.descriptions import TabularReward
+from irlcli.envs.gridworld import gridworld
+from irlcli.errors import UsageError
+from irlcli.runner import Runner
+from irlcli.stages.gridworlds import usable_input
+from irlcli.stages.sweep_maxent import variants
+from irlcli.store import Store
+
+GROUPS = ["path-group=1", "path-group=2", "path-group=3"]
+UNSEEN = ["blocked=1", "blocked=2"]
+METHODS = (
+    ["--method", "erm"],
+    ["--method", "erm", "--l2", "1e-3"],
+    ["--method", "erm-balanced"],
+    ["--method", "irm", "--penalty", "irmv1", "--penalty-weight", "0.05"],
+    ["--method", "irm", "--penalty", "closed-form"],
+    ["--method", "irm", "--features", "linear", "--seed", "3"],
+)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return tmp_path_factory.mktemp("gridworld") / "runs"
+
+
+@pytest.fixture
+def run(irl, store):
+    """A command at the smoke profile in the module's store."""
+    return lambda *arguments: irl(*arguments, "--profile", "smoke", "--store", store)
+
+
+@pytest.fixture
+def demos(run):
+    arguments = ["--intervention", "path-group=1,2,3", "--episodes", "20,5,2", "--name", "demos"]
+    done = run("collect-experts", "--env", "gridworld", *arguments)
+    assert done.code == 0, done.err
+    return Path(done.out.strip())
+
+
+def test_demonstrations_are_of_the_common_form_and_say_of_which_grid(demos):
+    dataset = read_demonstrations(demos)
+    assert {s: len(t) for s, t in dataset.trajectories.items()} == dict(
+        zip(GROUPS, (20, 5, 2), strict=True)
+    )
+    assert dataset.metadata["gridworld"] == {
+        **{"size": 5, "horizon": 16, "goal": "absorbing", "p_slip": 0.2}
+    }
+    summary = json.loads((demos / "summary.json").read_text())["settings"]
+    assert all(s["bar_met"] and -16 < s["mean_return"] <= -8 + 2 for s in summary)
+
+
+def test_grid_and_seed_are_part_of_the_identity(run, demos):
+    base = ["collect-experts", "--env", "gridworld", "--intervention", "path-group=1,2,3"]
+    base += ["--episodes", "20,5,2"]
+    ids = {run(*base, *more).out for more in ([], ["--seed", "1"])}
+    for change in ("size=6", "horizon=17", "goal=terminal", "p_slip=0.1"):
+        ids.add(run(*base, "--set", f"gridworld.{change}").out)
+    assert len(ids) == 6
+    assert f"{demos}\n" in ids
+
+
+def test_an_expert_below_its_bar_is_named(run):
+    arguments = ["--env", "gridworld", "--intervention", "path-group=2", "--set", "expert.bar=-1"]
+    done = run("collect-experts", *arguments)
+    assert done.code == 0
+    assert "path-group=2 misses its bar" in done.err
+
+
+@pytest.mark.parametrize("method", METHODS, ids=" ".join)
+def test_every_method_trains_and_is_found_again(run, demos, method):
+    command = ["train-maxent", "--demos", "demos", *method]
+    first = run(*command)
+    assert first.code == 0, first.err
+    assert "blocked=1 (unseen)" in first.err
+    again = run(*command)
+    assert again.out == first.out and "HIT train-maxent" in again.err
+    assert run(*command, "--dry-run").out.startswith("HIT")
+    artefact = Path(first.out.strip())
+    description, tensors = checkpoints.load(artefact / "reward.pt", "tabular-reward")
+    said = msgspec.convert(json.loads((artefact / "reward.json").read_text()), TabularReward)
+    assert description == said
+    assert description.gridworld.size == 5 and list(description.settings) == GROUPS
+    assert tensors["reward"].shape == (25,) and tensors["reward"].isfinite().all()
+    assert ("psi" in tensors) == ("linear" in method)
+    metrics = pq.read_table(artefact / "metrics.parquet").to_pydict()
+    assert metrics["setting"][:3] == GROUPS and metrics["iteration"][-1] == 59
+    quality = json.loads((artefact / "quality.json").read_text())["settings"]
+    assert [row["setting"] for row in quality] == GROUPS + UNSEEN
+    assert [row["seen"] for row in quality] == [True] * 3 + [False] * 2
+    assert all(0.0 <= row["goal_probability"] <= 1.0 for row in quality)
+
+
+def test_methods_differ(run, demos):
+    assert len({run("train-maxent", "--demos", "demos", *m).out for m in METHODS}) == len(METHODS)
+
+
+def test_figure_and_table(run, store):
+    first = run("report", "figure2", "--name", "fig")
+    assert first.code == 0, first.err
+    artefact = Path(first.out.strip())
+    assert (artefact / "figure2.png").read_bytes()[:4] == b"\x89PNG"
+    pdf = (artefact / "figure2.pdf").read_bytes()
+    assert pdf[:5] == b"%PDF-" and b"CreationDate" not in pdf
+    with open(artefact / "figure2.csv") as file:
+        rows = list(csv.DictReader(file))
+    names = {str(v) for v in variants([], [])}
+    assert {r["variant"] for r in rows} == names
+    assert {r["setting"] for r in rows} == {*GROUPS, *UNSEEN, "worst"}
+    assert all(float(r["low"]) <= float(r["mean"]) <= float(r["high"]) for r in rows)
+    assert (artefact / "figure2.md").read_text().count("\n") == 2 + len(names)
+    assert (artefact / "figure2.md").read_text() in first.err
+    plan = run("report", "figure2", "--dry-run").out.splitlines()
+    assert len(plan) == 4 and all(line.startswith("HIT") for line in plan)
+    lineage = run_light("lineage", "fig", "--store", store)
+    assert "sweep-maxent" in lineage and lineage.count("collect-experts") == 3
+
+
+def run_light(*arguments):
+    done = subprocess.run(
+        [sys.executable, "-m", "irlcli", *map(str, arguments)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_hits_load_nothing_heavy(run, demos, store):
+    common = ["--profile", "smoke", "--store", str(store)]
+    assert run("train-maxent", "--demos", "demos").code == 0
+    assert loaded_by("train-maxent", "--demos", "demos", *common) == "LOADED []"
+    assert run("report", "figure2").code == 0
+    assert loaded_by("report", "figure2", *common) == "LOADED []"
+
+
+COLLECT = ["collect-experts", "--env", "gridworld", "--intervention"]
+TRAIN = ["train-maxent", "--demos", "demos"]
+SIZE = ["--set", "gridworld.size=1024"]
+
+
+@pytest.mark.parametrize(
+    "command, named",
+    [
+        ([*COLLECT, "path-group=1.5"], "no whole number"),
+        ([*COLLECT, "path-group=4"], "out of range"),
+        ([*COLLECT, "path-group=-1"], "out of range"),
+        ([*COLLECT, "blocked=2x"], "not as multiplier"),
+        ([*COLLECT, "path-group=1,2", "--episodes", "3,0"], "2 settings"),
+        ([*COLLECT, "path-group=1", "--set", "gridworld.horizon=5"], "8 steps away"),
+        ([*COLLECT, "path-group=1", "--set", "gridworld.size=4"], ">= 5"),
+        ([*COLLECT, "path-group=1", "--set", "gridworld.p_slip=1"], "< 1.0"),
+        ([*COLLECT, "path-group=1", "--set", "gridworld.goal=open"], "open"),
+        ([*COLLECT, "path-group=1", *SIZE, "--set", "gridworld.horizon=3000"], "too many states"),
+        ([*COLLECT, "path-group=1", *SIZE, "--set", "gridworld.horizon=99"], "2046 steps away"),
+        ([*TRAIN, "--penalty-weight", "-1"], ">= 0.0"),
+        ([*TRAIN, "--penalty-weight", "nan"], ">= 0.0"),
+        ([*TRAIN, "--l2", "inf"], "l2"),
+        ([*TRAIN, "--method", "airl"], "airl"),
+        ([*TRAIN, "--penalty", "ridge"], "ridge"),
+        ([*TRAIN, "--features", "deep"], "deep"),
+        (["train-airl", "--demos", "demos"], "does not work on gridworld"),
+        (["evaluate", "--random", "--env", "gridworld", "--intervention", "blocked=1"], "does not"),
+        (["evaluate", "--expert", "--env", "gridworld", "--intervention", "blocked=1"], "does not"),
+        (["transfer", "--reward", "learned", "--ood", "blocked=1"], "is a tabular-reward"),
+        (["report", "figure3"], "unknown report"),
+        (["report", "figure2", "demos"], "no references"),
+        (["report", "returns"], "no evaluation"),
+        (["report", "figure2", "--set", "figure2.episodes=[1,2]"], "2 episode counts"),
+    ],
+)
+def test_bad_input_is_one_line_with_a_hint(run, demos, command, named):
+    if "learned" in command:
+        assert run(*TRAIN, "--name", "learned").code == 0
+    done = run(*command)
+    assert (done.code, done.out) == (2, ""), done
+    error, hint = done.err.splitlines()[-2:]
+    assert error.startswith("error: ") and named in error
+    assert hint.startswith("hint: ")
+
+
+def test_a_dataset_of_another_environment_is_refused(irl, smoke_store):
+    done = irl("train-maxent", "--demos", "demos", "--store", smoke_store.path)
+    assert done.code == 2
+    assert "train-maxent does not work on lunar-lander" in done.err
+    assert "train-airl" in done.err
+
+
+def test_a_missing_dataset(run, demos):
+    assert run("train-maxent", "--demos", "nothing").code == 3
+
+
+def test_a_goal_behind_walls_is_the_users_to_mend():
+    with pytest.raises(UsageError, match="cannot be reached"), usable_input():
+        gridworld(8, path_group=1, blocked=1)
+
+
+REQUEST = """
+from irlcli.interventions import parse_settings
+from irlcli.settings import load_settings
+from irlcli.stages import From, collect_experts, sweep_maxent, train_maxent
+
+def request(stage):
+    config = load_settings("gridworld", "smoke", overrides=["maxent.iterations=800"])
+    groups = parse_settings("gridworld", "path-group=1,2,3")
+    unseen = parse_settings("gridworld", "blocked=1")
+    if stage == "sweep-maxent":
+        return sweep_maxent.request("gridworld", groups, unseen, config)
+    demos = From(collect_experts.request("gridworld", groups, config, episodes=[9, 3, 2]))
+    return train_maxent.request(demos, "gridworld", groups, unseen, config.maxent)
+"""
+RUN = """
+import sys
+from irlcli.runner import Runner
+Runner(sys.argv[1], command=["irl", "test"], checkpoint_seconds=0.0).run(request(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("stage", ["train-maxent", "sweep-maxent"])
+def test_killed_and_run_again_it_is_the_same(tmp_path, stage):
+    command = [sys.executable, "-c", REQUEST + RUN, str(tmp_path / "killed"), stage]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not list(tmp_path.glob("killed/.work/*/checkpoint")):
+        time.sleep(0.001)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    namespace = {}
+    exec(REQUEST, namespace)
+    request = namespace["request"](stage)
+    resumed = Runner(tmp_path / "killed").run(request)
+    undisturbed = Runner(tmp_path / "undisturbed").run(request)
+    assert resumed.manifest.id == undisturbed.manifest.id
+    assert [a.provenance()["resumed"] for a in (resumed, undisturbed)] == [1, 0]
+    store = Store(tmp_path / "killed")
+    assert not store.verify(store.ids())
