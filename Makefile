@@ -36,6 +36,8 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.airl
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
+	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
+	else echo "benchmarks.bullet_step was left out: it counts instructions with valgrind"; fi
 
 # LunarLander with two engine powers to learn from and a third, unseen one to transfer to.
 # One seed and about half the standard budget: a look at the whole chain, not a comparison.

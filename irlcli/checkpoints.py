@@ -24,6 +24,7 @@ from msgspec import Struct
 
 from irlcli import descriptions
 from irlcli.errors import IntegrityError, NewerFormat, UsageError
+from irlcli.interventions import parse_setting
 from irlcli.irl.networks import RewardModel
 from irlcli.rl import Policy, load_policy
 
@@ -169,7 +170,8 @@ def load_policy_file(path: Path) -> tuple[Policy, descriptions.Policy]:
     """
     description, state = load(path, "policy")
     try:
-        return load_policy(description.network, state), description
+        setting = parse_setting(description.env, description.settings[0])
+        return load_policy(description.network, state, setting), description
     except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise _misfit(path, error) from None
 

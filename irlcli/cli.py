@@ -34,6 +34,7 @@ class Session:
         wait: bool = True,
         quiet: bool = False,
         tensorboard: Path | None = None,
+        workers: int = 1,
     ):
         from irlcli.store import Store
 
@@ -44,6 +45,7 @@ class Session:
         self._overrides = list(overrides)
         self._dry_run = dry_run
         self._wait = wait
+        self._workers = workers
         self._console = out.TerminalConsole(quiet, tensorboard)
 
     def settings(self, env: str, flags: dict[str, Any] | None = None):
@@ -59,7 +61,7 @@ class Session:
         if name is not None:
             # Before the work, not after it.
             self.store.check_name(name)
-        runner = Runner(self.store, self._console, self._wait)
+        runner = Runner(self.store, self._console, self._wait, workers=self._workers)
         if self._dry_run:
             self._print_plan([step for request in requests for step in runner.plan(request)])
             return []
@@ -129,6 +131,7 @@ def _common_options(runs: bool) -> list[inspect.Parameter]:
             option("overrides", [], list[str], "FIELD=VALUE, repeatable.", "--set"),
             option("dry_run", False, bool, "Say what would be done.", "--dry-run"),
             option("wait", True, bool, "Wait for a process making the same.", "--wait/--no-wait"),
+            option("workers", 1, int, "Processes that step environments.", "--workers", min=1),
             option("quiet", False, bool, "No progress on stderr.", "--quiet"),
             option("tensorboard", None, Path | None, "Mirror metrics here.", "--tensorboard"),
         ]
@@ -418,6 +421,50 @@ def _settings(env: str, config: Any, text: str, kind: str, origin: Any = None) -
     return parse_settings(env, f"{knob}={text}")
 
 
+@command("play", runs=False)
+def play(
+    session: Session,
+    policy: Annotated[str, typer.Argument(help="policy.pt or its artefact.")],
+    file: Annotated[Path, typer.Option("--out", help="GIF to write.")],
+    ood: Annotated[
+        str | None, typer.Option(help="VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB.")
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="At most this many.")] = 300,
+    seed: Seed = 0,
+) -> None:
+    """Draw a policy in the settings it was trained in, and in those of --ood beside them."""
+    from irlcli.interventions import parse_setting
+    from irlcli.references import tensor_file
+
+    source, origin = tensor_file(session.store, policy, "policy")
+    env = origin.env
+    settings = [parse_setting(env, text) for text in origin.settings]
+    if ood is not None:
+        added = _settings(env, session.settings(env), ood, "ood", origin)
+        settings += [setting for setting in added if setting not in settings]
+    if file.suffix.lower() != ".gif":
+        raise UsageError(f"{str(file)!r} does not end in .gif", "a GIF is what can be written")
+
+    from irlcli.checkpoints import load_policy_file
+    from irlcli.play import write_gif
+
+    path = source.path
+    if source.artefact is not None:
+        path = session.store.open(source.artefact, path.name)
+    player, _ = load_policy_file(path)
+    try:
+        write_gif(file, player, env, settings, steps, seed)
+    except OSError as error:
+        raise UsageError(
+            f"{file} cannot be written: {error.strerror or error}", "name another file with --out"
+        ) from None
+    if session.as_json:
+        played = {"path": str(file), "env": env, "settings": [str(s) for s in settings]}
+        out.print_json("play", played)
+    else:
+        out.print_data(str(file))
+
+
 @command("ls", runs=False)
 def ls(
     session: Session,
@@ -637,6 +684,7 @@ def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) 
                 "returns": list(row.returns),
                 "mean": row.mean,
                 "std_over_seeds": row.deviation,
+                "mean_progress": row.progress,
                 "episodes_per_seed": row.episodes,
             }
             for row in found
@@ -655,6 +703,10 @@ def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) 
         for row in found
     ]
     columns = ["agent", "setting", "true return", "sd over seeds", "seeds", "episodes each"]
+    if any(row.progress is not None for row in found):
+        columns.insert(3, "progress")
+        for cells, row in zip(table, found, strict=True):
+            cells.insert(3, "-" if row.progress is None else f"{row.progress:.1f}")
     out.print_table(columns, table, stderr=stderr)
 
 

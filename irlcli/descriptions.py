@@ -67,7 +67,9 @@ class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     maxent: MaxEntSettings
 
 
-class PolicyNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PolicyNetwork(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
+):
     """What ``rl.load_policy`` rebuilds a network from."""
 
     algorithm: Literal["ppo"]
@@ -75,6 +77,8 @@ class PolicyNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     net_arch: Widths
     activation: Activation
     ortho_init: bool
+    normalise_observations: bool = False
+    use_sde: bool = False
 
 
 class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -115,6 +119,7 @@ class Returns(Struct, frozen=True, kw_only=True):
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
     mean_return: Finite
+    mean_progress: Finite | None = None
 
 
 class Evaluation(Struct, frozen=True, kw_only=True):

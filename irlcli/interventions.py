@@ -85,6 +85,17 @@ class Environment(NamedTuple):
     tabular: bool = False
 
 
+_FRICTION = "tangential, torsional and rolling friction of the robot's links"
+_WALKER_KNOBS = {
+    "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "1x", "mass of every link"),
+    "goal-y": Knob(
+        "goal_y", ("absolute",), -10000.0, 10000.0, "0", "the goal is at (1000, goal-y) m"
+    ),
+    "direction": Knob(
+        "direction", ("absolute", "range"), -180.0, 180.0, "0", "of the goal, degrees from ahead"
+    ),
+}
+
 ENVIRONMENTS: dict[str, Environment] = {
     "lunar-lander": Environment(
         name="lunar-lander",
@@ -97,6 +108,36 @@ ENVIRONMENTS: dict[str, Environment] = {
                 "engine_power", ("multiplier",), 0.05, 20.0, "1x", "power of the main engine"
             ),
         },
+    ),
+    "ant": Environment(
+        name="ant",
+        gym_id="irlcli/Ant-v0",
+        max_episode_steps=1000,
+        knobs={
+            **_WALKER_KNOBS,
+            "friction": Knob("friction", ("triple",), 0.0, 10.0, "1.5:0:0", _FRICTION),
+            "leg-length": Knob(
+                "leg_length", ("multiplier",), 0.2, 5.0, "1x", "length of the hind legs"
+            ),
+        },
+    ),
+    "half-cheetah": Environment(
+        name="half-cheetah",
+        gym_id="irlcli/HalfCheetah-v0",
+        max_episode_steps=1000,
+        knobs={
+            **_WALKER_KNOBS,
+            "friction": Knob("friction", ("triple",), 0.0, 10.0, "0.8:0:0", _FRICTION),
+            "leg-length": Knob(
+                "leg_length", ("absolute", "multiplier"), 0.2, 5.0, "1", "length of both legs"
+            ),
+        },
+    ),
+    "reacher": Environment(
+        name="reacher",
+        gym_id="irlcli/Reacher-v0",
+        max_episode_steps=150,
+        knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "1x", "of 9.8 m/s^2")},
     ),
     "gridworld": Environment(
         name="gridworld",

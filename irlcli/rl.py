@@ -2,15 +2,17 @@
 
 PPO is trained in *rounds*. A round seeds every generator from (seed, round), starts fresh
 episodes, collects one or more rollouts and updates on each. What leaves a round is only the
-network, its optimiser and a step count, so a run continued from any round's checkpoint equals
+network, its optimiser, running moments and a step count, so a run continued from any round's checkpoint equals
 an uninterrupted one byte for byte on the same machine.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -19,18 +21,26 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from irlcli import envs
 from irlcli.descriptions import PolicyNetwork
 from irlcli.envs.vector import Ended, VectorWorlds
-from irlcli.errors import StageFailed
+from irlcli.envs.workers import WorkerFailed, WorkerWorlds
+from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import Setting, environment
 from irlcli.settings import PPOSettings
 from irlcli.trajectories import Trajectory
 
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+
+# Normalised observations and rewards are clipped to this, as in SB3's VecNormalize.
+_CLIP = 10.0
+
+Worlds = VectorWorlds | WorkerWorlds
 
 # Categorical re-checks its support on every one of millions of calls; SB3 builds it from
 # logits that are finite or the run has failed already.
@@ -42,7 +52,9 @@ class Rollout:
     """T steps of N worlds, time first. ``s`` is ``observations``, ``s'`` ``next_observations``.
 
     ``next_observations`` holds the true successor also where an episode ended (not the first
-    observation of the next episode). ``log_probs`` are log pi(a|s) of the sampling policy.
+    observation of the next episode). ``actions`` are the policy's samples: where they leave the
+    action space it is the environment that clips them. ``log_probs`` are log pi(a|s) of the
+    sampling policy. ``errors`` names the worlds whose episode could not go on, and why.
     """
 
     observations: np.ndarray  # [T, N, D] float32
@@ -54,6 +66,8 @@ class Rollout:
     truncated: np.ndarray  # [T, N] bool
     lengths: np.ndarray  # [T, N] int64: length of the episode that ended here, else 0
     returns: np.ndarray  # [T, N] float64: its true return
+    progress: np.ndarray  # [T, N] float64: its progress, NaN if the environment reports none
+    errors: tuple[tuple[int, str], ...]
 
 
 RewardFunction = Callable[[Rollout], np.ndarray]
@@ -62,7 +76,7 @@ RewardFunction = Callable[[Rollout], np.ndarray]
 class _RecordingVecEnv(VecEnv):
     """What SB3 steps: our worlds, plus a record of the transitions that its buffer drops."""
 
-    def __init__(self, worlds: VectorWorlds):
+    def __init__(self, worlds: Worlds):
         self.worlds = worlds
         super().__init__(len(worlds), worlds.observation_space, worlds.action_space)
         self.seeds: Sequence[int] = range(len(worlds))
@@ -101,38 +115,79 @@ class _RecordingVecEnv(VecEnv):
         self.worlds.close()
 
     def get_attr(self, attr_name, indices=None):
-        return [getattr(self.worlds.envs[i], attr_name) for i in self._get_indices(indices)]
+        # SB3 asks for the render mode: nothing is drawn in training.
+        return [None for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name, value, indices=None):
-        for i in self._get_indices(indices):
-            setattr(self.worlds.envs[i], attr_name, value)
+        raise AttributeError("training worlds may live in other processes")
 
     def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
-        return [
-            getattr(self.worlds.envs[i], method_name)(*method_args, **method_kwargs)
-            for i in self._get_indices(indices)
-        ]
+        raise AttributeError("training worlds may live in other processes")
 
     def env_is_wrapped(self, wrapper_class, indices=None):
         return [False for _ in self._get_indices(indices)]
 
 
+class _NormalisingExtractor(FlattenExtractor):
+    """Observations as (s - mean) / std by running moments, clipped.
+
+    The moments are buffers of the policy's network: saved with it, changed by :meth:`update` only.
+    """
+
+    def __init__(self, observation_space: gymnasium.Space):
+        super().__init__(observation_space)
+        self.register_buffer("mean", torch.zeros(self.features_dim, dtype=torch.float64))
+        self.register_buffer("variance", torch.ones(self.features_dim, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Normalised observations [B, D] float32."""
+        std = (self.variance + 1e-8).sqrt().float()
+        return ((observations - self.mean.float()) / std).clamp(-_CLIP, _CLIP)
+
+    def update(self, observations: np.ndarray) -> None:
+        """Merge the moments of ``observations`` [B, D]."""
+        moments = _moments(self.mean.numpy(), self.variance.numpy(), float(self.count))
+        moments.update(observations.astype(np.float64))
+        self.mean.copy_(torch.as_tensor(moments.mean))
+        self.variance.copy_(torch.as_tensor(moments.var))
+        self.count.fill_(moments.count)
+
+
+def _moments(mean: Any, variance: Any, count: float) -> RunningMeanStd:
+    moments = RunningMeanStd()
+    moments.mean, moments.var, moments.count = np.asarray(mean), np.asarray(variance), count
+    return moments
+
+
 class PPOTrainer:
     """SB3's PPO, one seeded round at a time.
+
+    With ``normalise_observations`` the moments take in each rollout after the update on it, so
+    that the policy updated is the one that acted. With ``normalise_rewards`` PPO is paid the
+    rewards over the running standard deviation of their discounted sums (SB3's VecNormalize).
+    Rollouts hold raw observations and raw rewards either way.
 
     Args:
         worlds: the environments to learn in.
         ppo: hyper-parameters.
         total_steps: environment steps the schedules run over.
         seed: everything random in round r derives from (seed, r).
+
+    Raises:
+        UsageError: gSDE, where actions are discrete.
     """
 
-    def __init__(self, worlds: VectorWorlds, ppo: PPOSettings, total_steps: int, seed: int):
+    def __init__(self, worlds: Worlds, ppo: PPOSettings, total_steps: int, seed: int):
         torch.set_num_threads(1)
         self.ppo = ppo
         self.total_steps = total_steps
         self.seed = seed
+        if ppo.use_sde and isinstance(worlds.action_space, gymnasium.spaces.Discrete):
+            raise UsageError("gSDE needs continuous actions", "leave ppo.use_sde unset")
         self._venv = _RecordingVecEnv(worlds)
+        self._reward_moments = _moments(0.0, 1.0, 0.0)
+        self._discounted = np.zeros(len(worlds))
         with warnings.catch_warnings():
             # A buffer that the batch size does not divide gives one short batch, as intended.
             warnings.filterwarnings("ignore", message=".*mini-batch size.*")
@@ -149,6 +204,8 @@ class PPOTrainer:
                 ent_coef=ppo.ent_coef,
                 vf_coef=ppo.vf_coef,
                 max_grad_norm=ppo.max_grad_norm,
+                use_sde=bool(ppo.use_sde),
+                sde_sample_freq=ppo.sde_sample_freq or -1,
                 policy_kwargs=_policy_kwargs(ppo),
                 seed=_derive(seed, -1)[0],
                 device="cpu",
@@ -184,8 +241,14 @@ class PPOTrainer:
         the value of its final observation; a terminated one is not.
 
         Raises:
-            StageFailed: the policy's parameters stopped being finite.
+            StageFailed: the policy's parameters stopped being finite, or a worker process died.
         """
+        try:
+            return self._train_round(index, reward)
+        except WorkerFailed as error:
+            raise StageFailed(str(error), "run the same command again to go on") from error
+
+    def _train_round(self, index: int, reward: RewardFunction | None) -> list[Rollout]:
         generator_seed, *world_seeds = _derive(self.seed, index, 1 + self._venv.num_envs)
         torch.manual_seed(generator_seed)
         # SB3 shuffles its minibatches by numpy's global generator.
@@ -193,11 +256,15 @@ class PPOTrainer:
         self._venv.seeds = world_seeds
         self.model._last_obs = self._venv.reset()
         self.model._last_episode_starts = np.ones(self._venv.num_envs, dtype=bool)
+        self._discounted[:] = 0.0
         rollouts = []
         for _ in range(self.ppo.rollouts_per_round):
             rollout = self._collect()
-            if reward is not None:
-                self._replace_rewards(rollout, reward(rollout))
+            if reward is not None or self.ppo.normalise_rewards:
+                rewards = rollout.true_rewards if reward is None else reward(rollout)
+                if self.ppo.normalise_rewards:
+                    rewards = self._normalised(rewards, rollout)
+                self._replace_rewards(rollout, rewards)
             remaining = max(0.0, 1.0 - self.model.num_timesteps / self.total_steps)
             self.model._current_progress_remaining = remaining
             if self.ppo.ent_coef_schedule == "linear":
@@ -209,8 +276,21 @@ class PPOTrainer:
                     f"the policy's parameters are not finite after an update in round {index}",
                     "a smaller learning rate or gradient norm usually helps",
                 )
+            if self.ppo.normalise_observations:
+                seen = rollout.observations
+                self.model.policy.features_extractor.update(seen.reshape(-1, seen.shape[-1]))
             rollouts.append(rollout)
         return rollouts
+
+    def _normalised(self, rewards: np.ndarray, rollout: Rollout) -> np.ndarray:
+        """``rewards`` [T, N] over the deviation of their discounted sums, this rollout's included."""
+        ended = rollout.terminated | rollout.truncated
+        sums = np.empty(rewards.shape)
+        for t in range(len(rewards)):
+            sums[t] = self._discounted = self.ppo.gamma * self._discounted + rewards[t]
+            self._discounted = np.where(ended[t], 0.0, self._discounted)
+        self._reward_moments.update(sums.ravel())
+        return np.clip(rewards / np.sqrt(self._reward_moments.var + 1e-8), -_CLIP, _CLIP)
 
     def _collect(self) -> Rollout:
         model, buffer = self.model, self.model.rollout_buffer
@@ -222,12 +302,14 @@ class PPOTrainer:
         next_observations = np.concatenate([observations[1:], model._last_obs[None]])
         terminated, truncated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         lengths, returns = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+        progress = np.full(shape, np.nan)
         for t, end in self._venv.ended:
             next_observations[t, end.world] = end.final_observation
             terminated[t, end.world] = end.terminated
             truncated[t, end.world] = not end.terminated
             lengths[t, end.world] = end.length
             returns[t, end.world] = end.episode_return
+            progress[t, end.world] = end.progress
         actions = buffer.actions.copy()
         if isinstance(model.action_space, gymnasium.spaces.Discrete):
             actions = actions[..., 0].astype(np.int64)
@@ -241,6 +323,8 @@ class PPOTrainer:
             truncated=truncated,
             lengths=lengths,
             returns=returns,
+            progress=progress,
+            errors=tuple((end.world, end.error) for _, end in self._venv.ended if end.error),
         )
 
     def _replace_rewards(self, rollout: Rollout, rewards: np.ndarray) -> None:
@@ -257,10 +341,12 @@ class PPOTrainer:
 
     def state_dict(self) -> dict[str, Any]:
         """What a later process needs to go on from the end of the last round (tensors, numbers)."""
+        moments = self._reward_moments
         return {
             "policy": self.model.policy.state_dict(),
             "optimizer": self.model.policy.optimizer.state_dict(),
             "steps": self.model.num_timesteps,
+            "reward_moments": [float(moments.mean), float(moments.var), float(moments.count)],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -268,10 +354,16 @@ class PPOTrainer:
         self.model.policy.load_state_dict(state["policy"])
         self.model.policy.optimizer.load_state_dict(state["optimizer"])
         self.model.num_timesteps = int(state["steps"])
+        # Checkpoints from before rewards could be normalised have none.
+        self._reward_moments = _moments(*state.get("reward_moments", (0.0, 1.0, 0.0)))
 
 
 class Policy:
-    """A stochastic policy pi(a|s), as SB3's actor-critic network."""
+    """A stochastic policy pi(a|s), as SB3's actor-critic network.
+
+    Of one trained with gSDE this is the distribution of a single action: its noise is drawn
+    anew at every step, while in training it is held for ``sde_sample_freq`` steps.
+    """
 
     def __init__(self, network: ActorCriticPolicy):
         self.network = network
@@ -280,7 +372,8 @@ class Policy:
         """Actions [N] or [N, A] for observations [N, D]; samples by torch's global generator."""
         with torch.no_grad():
             distribution = self.network.get_distribution(torch.as_tensor(observations))
-            return distribution.get_actions(deterministic=deterministic).numpy()
+            actions = distribution.mode() if deterministic else distribution.distribution.sample()
+            return actions.numpy()
 
     def log_prob(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """log pi(a|s) [B] for observations [B, D] and actions [B] or [B, A], without gradient."""
@@ -300,17 +393,23 @@ class Policy:
             net_arch=ppo.net_arch,
             activation=ppo.activation,
             ortho_init=ppo.ortho_init,
+            normalise_observations=bool(ppo.normalise_observations),
+            use_sde=bool(ppo.use_sde),
         )
 
 
-def load_policy(network_: PolicyNetwork, state: dict[str, torch.Tensor]) -> Policy:
+def load_policy(
+    network_: PolicyNetwork, state: dict[str, torch.Tensor], setting: Setting
+) -> Policy:
     """The policy that ``Policy.describe`` and ``Policy.state_dict`` wrote down.
+
+    ``setting`` is one that it was trained in: a goal, for one, adds to the observation.
 
     Raises:
         RuntimeError: the description and the tensors do not fit each other.
     """
     torch.set_num_threads(1)
-    world = envs.make(network_.env, Setting())
+    world = envs.make(network_.env, setting)
     network = ActorCriticPolicy(
         world.observation_space,
         world.action_space,
@@ -318,6 +417,8 @@ def load_policy(network_: PolicyNetwork, state: dict[str, torch.Tensor]) -> Poli
         net_arch=list(network_.net_arch),
         activation_fn=_ACTIVATIONS[network_.activation],
         ortho_init=network_.ortho_init,
+        features_extractor_class=_extractor(network_.normalise_observations),
+        use_sde=network_.use_sde,
     )
     world.close()
     network.load_state_dict(state)
@@ -325,12 +426,22 @@ def load_policy(network_: PolicyNetwork, state: dict[str, torch.Tensor]) -> Poli
     return Policy(network)
 
 
-def make_worlds(env: str, settings: Sequence[Setting], count: int) -> VectorWorlds:
-    """``count`` worlds in equal shares of each setting, as :func:`world_groups` says."""
-    return VectorWorlds(
-        [envs.make(env, settings[group]) for group in world_groups(count, len(settings))],
-        environment(env).max_episode_steps,
-    )
+def _extractor(normalising: bool) -> type[FlattenExtractor]:
+    return _NormalisingExtractor if normalising else FlattenExtractor
+
+
+def make_worlds(env: str, settings: Sequence[Setting], count: int, workers: int = 1) -> Worlds:
+    """``count`` worlds in equal shares of each setting, as :func:`world_groups` says.
+
+    More than one worker (and at most one per world) steps them in as many processes, to the
+    same results.
+    """
+    groups = world_groups(count, len(settings))
+    factories = [partial(envs.make, env, settings[group]) for group in groups]
+    limit = environment(env).max_episode_steps
+    if min(workers, count) > 1:
+        return WorkerWorlds(factories, limit, min(workers, count))
+    return VectorWorlds([factory() for factory in factories], limit)
 
 
 def world_groups(count: int, settings: int) -> np.ndarray:
@@ -350,6 +461,9 @@ def roll_out(
     """``episodes`` whole episodes of ``policy`` (or ``"random"``, ``"idle"``) in one setting.
 
     Episode k starts from its own seed derived from (seed, k), whatever the others do.
+
+    Raises:
+        UsageError: the setting's observations are not those the policy was trained on.
     """
     torch.set_num_threads(1)
     limit = environment(env).max_episode_steps
@@ -360,16 +474,36 @@ def roll_out(
         torch.manual_seed(seeds[0])
         rng = np.random.default_rng(seeds[0])
         worlds = [envs.make(env, setting) for _ in batch]
+        if isinstance(policy, Policy):
+            require_observations(policy, worlds[0].observation_space, f"{env} {setting}")
         trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, rng)
         for world in worlds:
             world.close()
     return trajectories
 
 
+def require_observations(policy: Policy, space: gymnasium.Space, where: str) -> None:
+    """Check that ``policy`` takes the observations of ``space``, those of ``where``.
+
+    Raises:
+        UsageError: it takes others.
+    """
+    size = policy.network.observation_space.shape[0]
+    if space.shape[0] != size:
+        raise UsageError(
+            f"the policy takes observations of size {size}, those of {where} have size "
+            f"{space.shape[0]}",
+            "a goal (goal-y, direction) is part of the observation: name a setting with the same "
+            "kind of intervention as in training",
+        )
+
+
 def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Trajectory]:
     observations = [[w.reset(seed=s)[0]] for w, s in zip(worlds, seeds, strict=True)]
     actions: list[list[Any]] = [[] for _ in worlds]
     rewards: list[list[float]] = [[] for _ in worlds]
+    progress = [math.nan for _ in worlds]
+    errors: list[str | None] = [None for _ in worlds]
     ends = [(False, False)] * len(worlds)
     active = list(range(len(worlds)))
     space = worlds[0].action_space
@@ -383,7 +517,10 @@ def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Traject
             chosen = _idle_actions(space, len(active))
         still = []
         for i, action in zip(active, chosen, strict=True):
-            observation, reward, terminated, truncated, _ = worlds[i].step(action)
+            observation, reward, terminated, truncated, info = worlds[i].step(action)
+            if "progress" in info:
+                progress[i] = (progress[i] if rewards[i] else 0.0) + info["progress"]
+            errors[i] = info.get("error")
             observations[i].append(np.asarray(observation, dtype=np.float32))
             actions[i].append(action)
             rewards[i].append(float(reward))
@@ -400,6 +537,8 @@ def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Traject
             terminated=ends[i][0],
             truncated=ends[i][1],
             seed=seeds[i],
+            progress=progress[i],
+            error=errors[i],
         )
         for i in range(len(worlds))
     ]
@@ -426,6 +565,8 @@ def _policy_kwargs(ppo: PPOSettings) -> dict[str, Any]:
         "net_arch": list(ppo.net_arch),
         "activation_fn": _ACTIVATIONS[ppo.activation],
         "ortho_init": ppo.ortho_init,
+        "log_std_init": ppo.log_std_init or 0.0,
+        "features_extractor_class": _extractor(bool(ppo.normalise_observations)),
         # One kernel for all parameters: the optimiser's step is most of a small network's update.
         "optimizer_kwargs": {"fused": True},
     }

@@ -32,7 +32,15 @@ from irlcli.store import (
 
 CHECKPOINT_SECONDS = 10.0
 _LIBRARIES = (
-    *("torch", "numpy", "scipy", "stable-baselines3", "gymnasium", "Box2D", "pyarrow", "msgspec"),
+    "torch",
+    "numpy",
+    "scipy",
+    "stable-baselines3",
+    "gymnasium",
+    "Box2D",
+    "pybullet",
+    "pyarrow",
+    "msgspec",
     "matplotlib",
 )
 
@@ -79,6 +87,7 @@ class Runner:
         wait: wait for another process that makes the same artefact, instead of failing.
         command: the command line to record; ``sys.argv`` by default.
         checkpoint_seconds: least time between two checkpoints [s].
+        workers: processes that step the environments; no part of any artefact's identity.
     """
 
     def __init__(
@@ -88,12 +97,14 @@ class Runner:
         wait: bool = True,
         command: list[str] | None = None,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
+        workers: int = 1,
     ):
         self.store = store if isinstance(store, Store) else Store(store)
         self.console = console if console is not None else Silent()
         self.wait = wait
         self.command = command if command is not None else ["irl", *sys.argv[1:]]
         self.checkpoint_seconds = checkpoint_seconds
+        self.workers = workers
 
     def plan(self, request: Request) -> list[Step]:
         """What :meth:`run` would do, inputs first; nothing is computed or written."""
@@ -185,7 +196,14 @@ class Runner:
             started = time.time()
             with checkpoints.listening():
                 request.stage.run(
-                    Job(request.parameters, inputs, output, checkpoints, self.console)
+                    Job(
+                        request.parameters,
+                        inputs,
+                        output,
+                        checkpoints,
+                        self.console,
+                        self.workers,
+                    )
                 )
             provenance = self._provenance(sources, started, checkpoints.resumed)
             published = self.store.publish(record, output, provenance)
@@ -221,6 +239,7 @@ class Runner:
             "python": platform.python_version(),
             "platform": platform.platform(),
             "device": "cpu",
+            "workers": self.workers,
             "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
             "seconds": round(time.time() - started, 3),
             "resumed": resumed,

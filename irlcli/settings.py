@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from irlcli.errors import UsageError, suggest
 from irlcli.interventions import environment, parse_settings
@@ -57,6 +57,13 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     net_arch: Widths = (64, 64)
     activation: Activation = "tanh"
     ortho_init: bool = True
+    # For continuous actions. Unset is off (or SB3's default) and not part of an artefact's key:
+    # what was made before these settings existed is still found.
+    log_std_init: Finite | UnsetType = UNSET
+    normalise_observations: bool | UnsetType = UNSET
+    normalise_rewards: bool | UnsetType = UNSET
+    use_sde: bool | UnsetType = UNSET
+    sde_sample_freq: Count | UnsetType = UNSET
 
 
 class InterventionSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -351,4 +358,6 @@ def _field_hint(field: str) -> str:
         value = getattr(value, name)
     if get_origin(kind) is Literal:
         return f"one of: {', '.join(get_args(kind))}"
+    if value is UNSET:
+        return "it is unset by default"
     return f"its default is {msgspec.json.encode(value).decode()}"

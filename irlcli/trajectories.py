@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -19,6 +20,8 @@ class Trajectory:
         terminated: the environment ended the episode; its value afterwards is zero.
         truncated: a time limit ended it; its value afterwards is not zero.
         seed: what the environment was reset with.
+        progress: sum of the environment's progress; NaN if it reports none or was not kept.
+        error: what ended an episode that could not go on, if anything.
 
     Raises:
         ValueError: shapes, types or flags that do not fit, or numbers that are not finite.
@@ -30,6 +33,8 @@ class Trajectory:
     terminated: bool
     truncated: bool
     seed: int
+    progress: float = math.nan
+    error: str | None = None
 
     def __post_init__(self) -> None:
         steps = len(self.rewards)

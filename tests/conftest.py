@@ -99,6 +99,12 @@ def store_copy(smoke_store: SmokeStore, tmp_path: Path) -> SmokeStore:
     return SmokeStore(**{**asdict(smoke_store), "path": path})
 
 
+@pytest.fixture(scope="session")
+def run_irl() -> Callable[[list[str]], Result]:
+    """:func:`run_main`, for fixtures that outlive a test."""
+    return run_main
+
+
 @pytest.fixture
 def irl(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """``irl("ls", "--store", path)`` in this process, through the real entry point."""

@@ -117,7 +117,7 @@ def test_policies_survive_saving():
     trainer = make_trainer()
     trainer.train_round(0)
     stored = from_bytes(to_bytes(trainer.policy.state_dict()))
-    policy = rl.load_policy(rl.Policy.describe("lunar-lander", trainer.ppo), stored)
+    policy = rl.load_policy(rl.Policy.describe("lunar-lander", trainer.ppo), stored, SETTINGS[0])
     observations = np.random.default_rng(0).normal(size=(20, 8)).astype(np.float32)
     np.testing.assert_array_equal(
         policy.act(observations, deterministic=True),

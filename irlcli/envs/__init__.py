@@ -12,6 +12,9 @@ from irlcli.interventions import ENVIRONMENTS, Setting, env_kwargs, environment
 
 _ENTRY_POINTS = {
     "lunar-lander": "irlcli.envs.lunar_lander:LunarLander",
+    "ant": "irlcli.envs.bullet.ant:Ant",
+    "half-cheetah": "irlcli.envs.bullet.half_cheetah:HalfCheetah",
+    "reacher": "irlcli.envs.bullet.reacher:Reacher",
     "gridworld": "irlcli.envs.gridworld:Gridworld",
 }
 

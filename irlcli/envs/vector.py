@@ -15,13 +15,19 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Ended:
-    """An episode that ended in this step."""
+    """An episode that ended in this step.
+
+    ``progress`` is the sum of ``info["progress"]``, NaN if the environment reports none;
+    ``error`` is ``info["error"]`` of the last step, what ended an episode that cannot go on.
+    """
 
     world: int
     final_observation: np.ndarray
     terminated: bool
     episode_return: float
     length: int
+    progress: float
+    error: str | None
 
 
 class VectorWorlds:
@@ -42,6 +48,7 @@ class VectorWorlds:
         self._discrete = isinstance(self.action_space, gymnasium.spaces.Discrete)
         self._lengths = np.zeros(len(self.envs), dtype=np.int64)
         self._returns = np.zeros(len(self.envs), dtype=np.float64)
+        self._progress = np.full(len(self.envs), np.nan)
 
     def __len__(self) -> int:
         return len(self.envs)
@@ -50,6 +57,7 @@ class VectorWorlds:
         """Start a fresh episode in every environment; observations [N, D] float32."""
         self._lengths[:] = 0
         self._returns[:] = 0.0
+        self._progress[:] = np.nan
         return np.stack(
             [env.reset(seed=int(seed))[0] for env, seed in zip(self.envs, seeds, strict=True)]
         )
@@ -66,9 +74,12 @@ class VectorWorlds:
         choices = actions.tolist() if self._discrete else actions
         self._lengths += 1
         for i, env in enumerate(self.envs):
-            observation, reward, terminated, truncated, _ = env.step(choices[i])
+            observation, reward, terminated, truncated, info = env.step(choices[i])
             rewards[i] = reward
             self._returns[i] += reward
+            if "progress" in info:
+                before = 0.0 if self._lengths[i] == 1 else self._progress[i]
+                self._progress[i] = before + info["progress"]
             if terminated or truncated or self._lengths[i] >= self.max_episode_steps:
                 ended.append(
                     Ended(
@@ -77,10 +88,13 @@ class VectorWorlds:
                         bool(terminated),
                         float(self._returns[i]),
                         int(self._lengths[i]),
+                        float(self._progress[i]),
+                        info.get("error"),
                     )
                 )
                 self._lengths[i] = 0
                 self._returns[i] = 0.0
+                self._progress[i] = np.nan
                 observation, _ = env.reset()
             observations[i] = observation
         return observations, rewards, ended

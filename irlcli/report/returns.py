@@ -21,6 +21,7 @@ class Row:
     setting: str
     returns: tuple[float, ...]  # mean true return of each seed
     episodes: int  # per seed
+    progress: float | None = None  # mean over seeds; None if the environment reports none
 
     @property
     def mean(self) -> float:
@@ -38,17 +39,20 @@ def rows(summaries: Iterable[Evaluation]) -> list[Row]:
 
     Experts first, random and idle last.
     """
-    groups: dict[tuple[int, str, str, str], list[tuple[float, int]]] = {}
+    groups: dict[tuple[int, str, str, str], list[tuple[float, int, float | None]]] = {}
     for summary in summaries:
         policy = summary.policy
         order = _ORDER.index(policy.agent)
         for item in summary.settings:
             key = (order, agent_name(policy), policy.env, item.setting)
-            groups.setdefault(key, []).append((item.mean_return, item.episodes))
-    return [
-        Row(agent, env, setting, tuple(r for r, _ in items), min(n for _, n in items))
-        for (_, agent, env, setting), items in sorted(groups.items())
-    ]
+            values = item.mean_return, item.episodes, item.mean_progress
+            groups.setdefault(key, []).append(values)
+    found = []
+    for (_, agent, env, setting), items in sorted(groups.items()):
+        returns, episodes, progress = zip(*items, strict=True)
+        mean = None if None in progress else statistics.fmean(progress)
+        found.append(Row(agent, env, setting, returns, min(episodes), mean))
+    return found
 
 
 def agent_name(policy: Subject) -> str:

@@ -42,13 +42,17 @@ class Checkpoints(Protocol):
 
 
 class Job(NamedTuple):
-    """What a stage works with: inputs by role (files or directories), and where to write."""
+    """What a stage works with: inputs by role (files or directories), and where to write.
+
+    ``workers`` processes may step the environments; results do not depend on it.
+    """
 
     parameters: Any
     inputs: Mapping[str, Path]
     output: Path
     checkpoints: Checkpoints
     console: Console
+    workers: int = 1
 
 
 class Stage(NamedTuple):

@@ -79,7 +79,7 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_demonstrations
-    from irlcli.stages.outputs import write_json
+    from irlcli.stages.outputs import shown, warn_of_errors, write_json
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
@@ -89,9 +89,10 @@ def run(job: Job) -> None:
         policy, _ = load_policy_file(job.inputs[f"expert {text}"])
         seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
         trajectories = rl.roll_out(p.env, setting, policy, episodes, seed, p.deterministic)
+        warn_of_errors(job, text, trajectories)
         groups.append((setting, trajectories))
         summary.append(_summary(p.env, text, trajectories, p.bar, job.console))
-        facts = {text: f"return {summary[-1]['mean_return']:.0f}"}
+        facts = {text: shown(summary[-1]["mean_return"], summary[-1]["mean_progress"])}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {
         "experts": {text: file_digest(job.inputs[f"expert {text}"]) for text in p.settings},
@@ -127,6 +128,7 @@ def _summary(
     import numpy as np
 
     returns = np.array([t.episode_return for t in trajectories])
+    progress = float(np.mean([t.progress for t in trajectories]))
     met = None if bar is None else bool(returns.mean() >= bar)
     if met is False:
         console.warn(
@@ -138,6 +140,7 @@ def _summary(
         "episodes": len(returns),
         "mean_return": float(returns.mean()),
         "std_return": float(returns.std()),
+        "mean_progress": None if np.isnan(progress) else progress,
         "mean_length": float(np.mean([len(t) for t in trajectories])),
         "bar": bar,
         "bar_met": met,

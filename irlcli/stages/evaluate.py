@@ -53,7 +53,7 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_table
-    from irlcli.stages.outputs import write_json
+    from irlcli.stages.outputs import shown, warn_of_errors, write_json
 
     p: Parameters = job.parameters
     policy, subject = p.agent, {"agent": p.agent, "env": p.env}
@@ -72,12 +72,15 @@ def run(job: Job) -> None:
             seed,
             p.evaluation.deterministic,
         )
+        warn_of_errors(job, text, trajectories)
+        progress = float(np.mean([t.progress for t in trajectories]))
         rows += [
             {
                 "setting": text,
                 "episode": k,
                 "seed": t.seed,
                 "true_return": t.episode_return,
+                "progress": t.progress,
                 "length": len(t),
                 "terminated": t.terminated,
             }
@@ -90,12 +93,13 @@ def run(job: Job) -> None:
                 "episodes": len(returns),
                 "mean_return": float(returns.mean()),
                 "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
+                "mean_progress": None if np.isnan(progress) else progress,
                 "mean_length": float(np.mean([len(t) for t in trajectories])),
                 "terminated": float(np.mean([t.terminated for t in trajectories])),
             }
         )
         job.console.progress(
-            index + 1, len(p.settings), "settings", {text: f"return {returns.mean():.0f}"}
+            index + 1, len(p.settings), "settings", {text: shown(returns.mean(), progress)}
         )
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
     write_json(job.output / "summary.json", {"policy": subject, "settings": summary})

@@ -13,6 +13,7 @@ from irlcli import checkpoints
 from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
 from irlcli.stages import Job
 from irlcli.stages.adversary import Adversary
+from irlcli.stages.outputs import shown
 
 Row = dict[str, Any]
 
@@ -40,6 +41,7 @@ def train_rounds(
         first, rows = state["round"], json.loads(state["rows"])
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
+        _warn(job, index, rollouts, settings)
         newest = episode_rows(index, trainer.steps, rollouts, settings)
         if adversary is not None:
             for row, diagnostics in zip(
@@ -65,12 +67,23 @@ def _state(
     )
 
 
+def _warn(job: Job, index: int, rollouts: Sequence[Rollout], settings: Sequence[str]) -> None:
+    """Name the worlds whose episode could not go on."""
+    groups = world_groups(rollouts[0].terminated.shape[1], len(settings))
+    for world, error in (e for rollout in rollouts for e in rollout.errors):
+        job.console.warn(
+            f"{settings[groups[world]]}, world {world}, round {index}: {error}; the episode ended "
+            "there and training goes on"
+        )
+
+
 def episode_rows(
     index: int, steps: int, rollouts: Sequence[Rollout], settings: Sequence[str]
 ) -> list[Row]:
     """One row per setting: true return and length of the episodes that ended in this round.
 
-    A setting in which none ended has NaN, not zero.
+    A setting in which none ended has NaN, not zero; so has the progress of an environment that
+    reports none.
     """
     groups = world_groups(rollouts[0].terminated.shape[1], len(settings))
     rows = []
@@ -80,6 +93,7 @@ def episode_rows(
         returns = np.concatenate([r.returns[:, columns].ravel() for r in rollouts])[ended]
         lengths = np.concatenate([r.lengths[:, columns].ravel() for r in rollouts])[ended]
         terminated = np.concatenate([r.terminated[:, columns].ravel() for r in rollouts])[ended]
+        progress = np.concatenate([r.progress[:, columns].ravel() for r in rollouts])[ended]
         rows.append(
             {
                 "round": index,
@@ -87,6 +101,7 @@ def episode_rows(
                 "setting": setting,
                 "episodes": int(ended.sum()),
                 "true_return": _mean(returns),
+                "progress": _mean(progress),
                 "episode_length": _mean(lengths),
                 "terminated": _mean(terminated),
             }
@@ -95,7 +110,7 @@ def episode_rows(
 
 
 def _report(job: Job, trainer: PPOTrainer, newest: Sequence[Row]) -> None:
-    facts = {row["setting"]: f"return {row['true_return']:.0f}" for row in newest}
+    facts = {row["setting"]: shown(row["true_return"], row["progress"]) for row in newest}
     if "accuracy" in newest[0]:
         accuracy = np.mean([row["accuracy"] for row in newest])
         facts["discriminator"] = f"accuracy {accuracy:.2f}"

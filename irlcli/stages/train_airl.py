@@ -1,6 +1,7 @@
 """Adversarial IRL from demonstrations: ERM, ERM-balanced or IRM (paper Algorithm 1)."""
 
 from collections.abc import Sequence
+from contextlib import closing
 
 import msgspec
 
@@ -32,9 +33,15 @@ def request(
     ``metrics.parquet`` with one row per round and setting.
 
     Raises:
-        UsageError: a tabular environment, or the worlds cannot be shared equally by the settings.
+        UsageError: a tabular environment, gSDE, or worlds that the settings cannot share equally.
     """
     check_tabular(env, "train-airl", wanted=False)
+    if airl.ppo.use_sde:
+        raise UsageError(
+            "airl.ppo.use_sde: AIRL needs log pi(a|s) of the action taken, and gSDE's noise "
+            "outlasts a step",
+            "leave it unset; airl.ppo.log_std_init sets how much the policy explores",
+        )
     texts = tuple(str(s) for s in settings_)
     if airl.ppo.n_envs % len(texts):
         raise UsageError(
@@ -62,12 +69,11 @@ def run(job: Job) -> None:
             f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, not of "
             f"{p.env} {', '.join(settings)}"
         )
-    worlds = rl.make_worlds(
-        demos.env, [parse_setting(demos.env, s) for s in settings], p.airl.ppo.n_envs
-    )
-    trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
-    adversary = Adversary(demos, p.airl, worlds, p.seed)
-    rows = train_rounds(job, trainer, settings, adversary=adversary)
+    parsed = [parse_setting(demos.env, s) for s in settings]
+    with closing(rl.make_worlds(demos.env, parsed, p.airl.ppo.n_envs, job.workers)) as worlds:
+        trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
+        adversary = Adversary(demos, p.airl, worlds, p.seed)
+        rows = train_rounds(job, trainer, settings, adversary=adversary)
     origin = {"settings": p.settings, "method": p.airl.method, "seed": p.seed}
     write_policy(job.output, trainer.policy, p.airl.ppo, p.env, agent="student", **origin)
     adversary.write_reward(job.output, env=p.env, airl=p.airl, **origin)

@@ -1,5 +1,7 @@
 """Expert of one setting: PPO on the true reward. Trained once, shared by every dataset."""
 
+from contextlib import closing
+
 import msgspec
 
 from irlcli.interventions import Setting, check_tabular
@@ -42,9 +44,10 @@ def run(job: Job) -> None:
     from irlcli.stages.policy_training import train_rounds
 
     p: Parameters = job.parameters
-    worlds = rl.make_worlds(p.env, [parse_setting(p.env, p.setting)], p.ppo.n_envs)
-    trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed)
-    rows = train_rounds(job, trainer, [p.setting])
+    settings = [parse_setting(p.env, p.setting)]
+    with closing(rl.make_worlds(p.env, settings, p.ppo.n_envs, job.workers)) as worlds:
+        trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed)
+        rows = train_rounds(job, trainer, [p.setting])
     write_policy(
         job.output,
         trainer.policy,

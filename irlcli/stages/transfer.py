@@ -1,7 +1,10 @@
 """A new policy, from random initialisation, on a frozen reward in an unseen setting (Sec. 5.3)."""
 
+from contextlib import closing
+
 import msgspec
 
+from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.settings import TransferSettings
 from irlcli.stages import From, Job, Request, Source, Stage
@@ -56,9 +59,18 @@ def run(job: Job) -> None:
         g = airl.policy_reward(model, data, log_probs, "g", absorbing, ppo.gamma)
         return (g / origin.scale).numpy().reshape(rollout.terminated.shape)
 
-    worlds = rl.make_worlds(p.env, [parse_setting(p.env, p.setting)], ppo.n_envs)
-    trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed)
-    rows = train_rounds(job, trainer, [p.setting], reward)
+    settings = [parse_setting(p.env, p.setting)]
+    with closing(rl.make_worlds(p.env, settings, ppo.n_envs, job.workers)) as worlds:
+        size, learned = worlds.observation_space.shape[0], origin.network.observation_size
+        if size != learned:
+            raise UsageError(
+                f"the reward takes observations of size {learned}, those of {p.env} {p.setting} "
+                f"have size {size}",
+                "a goal (goal-y, direction) is part of the observation: transfer to a setting "
+                "with the same kind of intervention as in training",
+            )
+        trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed)
+        rows = train_rounds(job, trainer, [p.setting], reward)
     write_policy(
         job.output,
         trainer.policy,

@@ -1,0 +1,82 @@
+"""Instructions that one step of each PyBullet environment executes, counted by callgrind.
+
+    python benchmarks/bullet_step.py [ant half-cheetah reacher ant-original ...]
+
+Counts are the difference of two run lengths, so start-up, reset and imports cancel, and they
+do not depend on what else the machine is doing. Needs ``valgrind`` on the path. Actions are
+uniform in the whole range, the same for every run.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+
+SHORT, LONG = 200, 500
+WORLDS = ("ant", "half-cheetah", "reacher")
+
+
+def make(name: str):
+    """The environment called ``name``, the original model if it ends in ``-original``."""
+    from irlcli.envs.bullet.ant import Ant
+    from irlcli.envs.bullet.half_cheetah import HalfCheetah
+    from irlcli.envs.bullet.reacher import Reacher
+
+    robots = {"ant": Ant, "half-cheetah": HalfCheetah, "reacher": Reacher}
+    robot = robots[name.removesuffix("-original")]
+    return robot(model="original" if name.endswith("-original") else "merged")
+
+
+def roll_out(name: str, steps: int) -> None:
+    """Take ``steps`` random steps of one episode."""
+    env = make(name)
+    env.reset(seed=0)
+    random = np.random.default_rng(0)
+    for action in random.uniform(-1.0, 1.0, (LONG, *env.action_space.shape))[:steps]:
+        env.step(action)
+    env.close()
+
+
+def instructions(name: str, steps: int) -> int:
+    """Instructions of a whole process that takes ``steps`` steps."""
+    with tempfile.NamedTemporaryFile() as out:
+        done = subprocess.run(
+            [
+                "valgrind",
+                "--tool=callgrind",
+                f"--callgrind-out-file={out.name}",
+                sys.executable,
+                __file__,
+                "--roll-out",
+                name,
+                str(steps),
+            ],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1"},
+            check=True,
+        )
+    match = re.search(r"Collected : (\d+)", done.stderr)
+    if match is None:
+        raise RuntimeError(f"callgrind printed no count:\n{done.stderr}")
+    return int(match.group(1))
+
+
+def main(names: list[str]) -> None:
+    """Print one line per environment."""
+    for name in names or list(WORLDS):
+        roll_out(name, 1)  # so that no counted run compiles bytecode
+        count = (instructions(name, LONG) - instructions(name, SHORT)) / (LONG - SHORT)
+        print(f"{name:22s} {count / 1e6:6.3f} M instructions per step", flush=True)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--roll-out"]:
+        roll_out(sys.argv[2], int(sys.argv[3]))
+    else:
+        main(sys.argv[1:])

@@ -1,0 +1,6 @@
+"""The PyBullet robots of the paper's Sec. 5.2, with the interventions of Table 2.
+
+Each robot comes as two models: ``"merged"``, built from data with every fixed joint merged
+away, and ``"original"``, the MJCF file of ``pybullet_data``. Lengths are metres, angles
+radians, masses kilograms, forces newtons and torques newton metres unless said otherwise.
+"""

@@ -1,0 +1,221 @@
+"""The PyBullet Reacher with the gravity intervention of the paper's Sec. 5.2 and Table 2.
+
+Observation, reward and physics are those of pybullet-gym's ReacherBulletEnv.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import pybullet
+
+from irlcli.envs.bullet.world import (
+    FROM_TO_MARGIN,
+    GRAVITY,
+    NOT_FINITE,
+    TIME_STEP,
+    Capsule,
+    Link,
+    Robot,
+    World,
+    box_inertia,
+    clipped,
+    is_finite,
+    require,
+    require_model,
+    single,
+    start_positions,
+)
+
+_RADIUS = single(0.01)
+_BALL_RADIUS = 0.01
+_HEIGHT = single(0.01)
+_UPPER = single(0.1)
+_FINGERTIP = single(0.11)
+_ELBOW_LIMIT = 3.0
+_TORQUE = 0.05
+_TARGET_LIMIT = 0.27
+
+
+def morphology() -> tuple[Link, list[Link]]:
+    """The Reacher's fixed base and its 2 links: 2 where the original has 5.
+
+    The fingertip's ball is one body with the lower arm that carries it.
+    """
+    arm = Capsule((0.0, 0.0, 0.0), (_UPPER, 0.0, 0.0), _RADIUS)
+    thickness = 2.0 * (_RADIUS + FROM_TO_MARGIN)
+    inertia = box_inertia(arm.mass, (_UPPER + thickness, thickness, thickness))
+    ball = Capsule((_FINGERTIP, 0.0, 0.0), (_FINGERTIP, 0.0, 0.0), _BALL_RADIUS)
+    mass = arm.mass + ball.mass
+    center = (arm.mass * arm.center[0] + ball.mass * _FINGERTIP) / mass
+    # Parallel axes: both centres of mass lie on x, so only the moments about y and z grow.
+    offset = arm.mass * (arm.center[0] - center) ** 2 + ball.mass * (_FINGERTIP - center) ** 2
+    own = 0.4 * ball.mass * _BALL_RADIUS**2
+    lower = (inertia[0] + own, inertia[1] + own + offset, inertia[2] + own + offset)
+    links = [
+        Link(arm.mass, inertia, (arm,), arm.center, anchor=(0.0, 0.0, _HEIGHT)),
+        Link(
+            mass,
+            lower,
+            (arm, ball),
+            (center, 0.0, 0.0),
+            parent=0,
+            anchor=(_UPPER, 0.0, 0.0),
+            limits=(-_ELBOW_LIMIT, _ELBOW_LIMIT),
+        ),
+    ]
+    return Link(0.0, (0.0, 0.0, 0.0)), links
+
+
+class Reacher(gymnasium.Env):
+    """A two-link arm in a horizontal plane that moves its fingertip to a target.
+
+    Observation [9] float32: target x and y, fingertip minus target x and y, cosine and sine of
+    the shoulder's angle, its speed / 10, the elbow's angle / 3, its speed / 10. Action [2]:
+    torques of shoulder and elbow in units of 0.05 N m, clipped to [-1, 1].
+
+    The reward is the sum of the terms in ``info``: ``progress`` (100 times the distance gained
+    on the target), ``control`` (work and stall cost of the clipped action) and ``stuck`` (-0.1
+    with the elbow at its limit). An episode never terminates. A world whose state is no longer
+    finite truncates the episode at its last finite observation, pays nothing, and says so in
+    ``info["error"]``.
+
+    Both joints are vertical, so gravity loads their bearings but cannot turn them: the paper
+    finds that gravity plays little role here, and in this model it plays none.
+
+    Args:
+        gravity: multiplier of 9.8 m/s^2 downward, in [0, 20]; the original has none.
+        model: ``"merged"`` or ``"original"`` (5 links).
+        render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
+
+    Raises:
+        ValueError: a value outside the range given.
+        RuntimeError: ``"human"`` without a display.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": round(1.0 / TIME_STEP),
+    }
+
+    def __init__(self, gravity: float = 1.0, model: str = "merged", render_mode: str | None = None):
+        self.gravity = require("gravity", gravity, 0.0, 20.0)
+        self.model = require_model(model)
+        self.render_mode = render_mode
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self._world = World(render_mode, self.gravity * GRAVITY, substeps=1, ground=False)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; ``options["joint_positions"]`` [4] replaces the drawn start.
+
+        The positions are those of shoulder and elbow, and the target's x and y.
+
+        Raises:
+            ValueError: another option, another shape, or a number that is not finite.
+        """
+        super().reset(seed=seed)
+        positions = start_positions(options, 4)
+        if positions is None:
+            positions = np.concatenate(
+                [
+                    self.np_random.uniform(-3.14, 3.14, 2),
+                    self.np_random.uniform(-_TARGET_LIMIT, _TARGET_LIMIT, 2),
+                ]
+            )
+        self._target = float(positions[2]), float(positions[3])
+        self._world.clear()
+        self._robot = self._place()
+        self._robot.place(positions[:2])
+        self._observation, self._potential = self._observe()
+        return self._observation, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance 0.0165 s.
+
+        Raises:
+            ValueError: an action of another shape, or not finite.
+        """
+        action = clipped(action, 2)
+        self._robot.drive(_TORQUE * action)
+        self._world.step()
+        observation, potential = self._observe()
+        if not is_finite(observation):
+            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
+        first, second = abs(action[0]), abs(action[1])
+        speeds = abs(float(observation[6])), abs(float(observation[8]))
+        control = -0.1 * (first * speeds[0] + second * speeds[1]) - 0.01 * (first + second)
+        stuck = -0.1 if abs(abs(float(observation[7])) - 1.0) < 0.01 else 0.0
+        progress = potential - self._potential
+        self._observation = observation
+        self._potential = potential
+        if self.render_mode == "human":
+            self._world.look_at((0.0, 0.0, 0.0), 0.6)
+        info = {"progress": progress, "control": control, "stuck": stuck}
+        return observation, progress + control + stuck, False, False, info
+
+    def render(self) -> np.ndarray | None:
+        """A picture of the arm [240, 320, 3] uint8; ``None`` unless ``"rgb_array"``."""
+        if self.render_mode != "rgb_array":
+            return None
+        return self._world.image((0.0, 0.0, 0.0), 0.6)
+
+    def close(self) -> None:
+        """Disconnect from Bullet."""
+        self._world.close()
+
+    def _place(self) -> Robot:
+        """The arm and its target."""
+        client = self._world.client
+        if self.model == "original":
+            *_, arm, target = self._world.load("reacher.xml")
+            for joint, position in enumerate(self._target):
+                pybullet.resetJointState(target, joint, position, physicsClientId=client)
+            return Robot(client, arm, (0, 2), (0, 2))
+        arm = self._world.build(*morphology(), (0.0, 0.0, 0.0))
+        for link in range(2):
+            # The original's geometries do not collide either.
+            pybullet.setCollisionFilterGroupMask(arm, link, 0, 0, physicsClientId=client)
+        robot = Robot(client, arm, (0, 1), (0, 1))
+        if self.render_mode is not None:
+            robot.paint((0.0, 0.4, 0.6, 1.0))
+            pybullet.createMultiBody(
+                0.0,
+                baseVisualShapeIndex=pybullet.createVisualShape(
+                    pybullet.GEOM_SPHERE,
+                    radius=0.009,
+                    rgbaColor=(0.9, 0.2, 0.2, 1.0),
+                    physicsClientId=client,
+                ),
+                basePosition=(*self._target, _HEIGHT),
+                physicsClientId=client,
+            )
+        return robot
+
+    def _observe(self) -> tuple[np.ndarray, float]:
+        """The observation and -100 times the fingertip's distance to the target."""
+        (shoulder, elbow), (shoulder_speed, elbow_speed) = self._robot.states()
+        # The original reads links' cached positions, which are one step old.
+        upper = shoulder - TIME_STEP * shoulder_speed
+        lower = upper + elbow - TIME_STEP * elbow_speed
+        x = _UPPER * math.cos(upper) + _FINGERTIP * math.cos(lower) - self._target[0]
+        y = _UPPER * math.sin(upper) + _FINGERTIP * math.sin(lower) - self._target[1]
+        observation = np.array(
+            [
+                *self._target,
+                x,
+                y,
+                math.cos(shoulder),
+                math.sin(shoulder),
+                0.1 * shoulder_speed,
+                elbow / _ELBOW_LIMIT,
+                0.1 * elbow_speed,
+            ],
+            dtype=np.float32,
+        )
+        return observation, -100.0 * math.hypot(x, y)

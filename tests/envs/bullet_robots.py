@@ -1,0 +1,49 @@
+"""What the tests of the PyBullet robots share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pytest
+
+from irlcli.envs.bullet.ant import Ant
+from irlcli.envs.bullet.half_cheetah import HalfCheetah
+from irlcli.envs.bullet.reacher import Reacher
+
+ROBOTS = {"ant": Ant, "half_cheetah": HalfCheetah, "reacher": Reacher}
+
+
+def trace(name: str) -> dict[str, np.ndarray]:
+    """A recorded trace of the original environments; skips where there is none."""
+    for parent in Path(__file__).resolve().parents:
+        path = parent / "shared" / "reference" / f"pybullet_gym_{name}.npz"
+        if path.exists():
+            with np.load(path) as arrays:
+                return dict(arrays)
+    pytest.skip("the recorded traces of the original environments are not here")
+
+
+def replay(env, recorded: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Observations [T+1, D] and rewards [T] of a trace's actions from its start."""
+    start = recorded["initial_joint_positions"]
+    observations = [env.reset(seed=0, options={"joint_positions": start})[0]]
+    rewards = []
+    for action in recorded["actions"]:
+        observation, reward, *_ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+    return np.array(observations), np.array(rewards)
+
+
+def body(env) -> tuple[int, int]:
+    """Bullet's body and client id of an environment's robot."""
+    return env._robot.body, env._robot.client
+
+
+def total_mass(env) -> float:
+    """Mass of all links, by Bullet's own account."""
+    robot, client = body(env)
+    links = range(-1, pybullet.getNumJoints(robot, physicsClientId=client))
+    return sum(pybullet.getDynamicsInfo(robot, i, physicsClientId=client)[0] for i in links)

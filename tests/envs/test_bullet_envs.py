@@ -1,0 +1,226 @@
+"""The PyBullet robots as gymnasium environments: interface, seeds, bad input, rendering."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pybullet
+import pytest
+from bullet_robots import ROBOTS, body
+from gymnasium.utils.env_checker import check_env
+
+from irlcli.envs.bullet.ant import Ant
+from irlcli.envs.vector import VectorWorlds
+
+EVERY = [(name, model) for name in ROBOTS for model in ("merged", "original")]
+SIZES = {"ant": (27, 8, 8), "half_cheetah": (17, 6, 9), "reacher": (9, 2, 4)}
+
+
+@pytest.fixture(params=sorted(ROBOTS))
+def env(request):
+    env = ROBOTS[request.param]()
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize(("name", "model"), EVERY)
+def test_passes_gymnasiums_check(name, model):
+    env = ROBOTS[name](model=model)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+def test_has_the_documented_sizes(name):
+    env = ROBOTS[name]()
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == env.observation_space.shape == (SIZES[name][0],)
+    assert observation.dtype == np.float32
+    assert env.action_space.shape == (SIZES[name][1],)
+    env.close()
+
+
+def test_full_observation_adds_the_originals_zeros():
+    env = Ant(full_observation=True)
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (111,)
+    assert not observation[27:].any()
+    env.close()
+
+
+def roll(env, seed: int, steps: int = 60) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    path = [env.reset(seed=seed)[0]]
+    for _ in range(steps):
+        path.append(env.step(random.uniform(-1, 1, env.action_space.shape))[0])
+    return np.array(path)
+
+
+def test_an_episode_is_a_function_of_its_seed_whatever_came_before(env):
+    expected = roll(env, 7)
+    roll(env, 8)
+    np.testing.assert_array_equal(roll(env, 7), expected)
+    fresh = type(env)()
+    np.testing.assert_array_equal(roll(fresh, 7), expected)
+    fresh.close()
+    assert not np.array_equal(roll(env, 8), expected)
+
+
+def test_worlds_of_one_process_do_not_touch(env):
+    expected = roll(env, 3)
+    other = type(env)()
+    other.reset(seed=4)
+    env.reset(seed=3)
+    random = np.random.default_rng(3)
+    for row in expected[1:]:
+        other.step(np.ones(env.action_space.shape))
+        action = random.uniform(-1, 1, env.action_space.shape)
+        np.testing.assert_array_equal(env.step(action)[0], row)
+    other.close()
+
+
+def test_actions_beyond_the_actuators_range_are_clipped(env):
+    size = env.action_space.shape
+    env.reset(seed=0)
+    clipped = env.step(np.full(size, 1.0))
+    env.reset(seed=0)
+    beyond = env.step(np.full(size, 50.0))
+    np.testing.assert_array_equal(clipped[0], beyond[0])
+    assert clipped[1] == beyond[1]
+
+
+def test_the_reward_is_the_sum_of_its_terms(env):
+    env.reset(seed=0)
+    for _ in range(20):
+        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert reward == pytest.approx(sum(info.values()))
+        assert not terminated
+        assert not truncated
+
+
+def test_an_idle_ant_is_paid_for_being_alive():
+    env = Ant()
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(8))[4] for _ in range(300)]
+    env.close()
+    assert sum(info["alive"] for info in infos) == 300.0
+    assert abs(sum(info["progress"] for info in infos)) * 0.0165 < 1.0
+
+
+def test_joint_positions_set_the_start(env):
+    size = {Ant: 8}.get(type(env), 9 if env.action_space.shape == (6,) else 4)
+    positions = np.linspace(0.01, 0.05, size)
+    observation, _ = env.reset(seed=0, options={"joint_positions": positions})
+    if isinstance(env, Ant):
+        np.testing.assert_allclose(observation[5:13], positions, rtol=1e-6)
+    elif size == 9:
+        np.testing.assert_allclose(observation[:8], positions[1:], rtol=1e-6)
+    else:
+        np.testing.assert_allclose(observation[:2], positions[2:], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"joint_positions": [0.0]}, "finite numbers"),
+        ({"joint_positions": [math.nan] * 8}, "finite numbers"),
+        ({"positions": [0.0] * 8}, "the only reset option is 'joint_positions'"),
+    ],
+)
+def test_bad_reset_options_are_refused(options, message):
+    env = Ant()
+    with pytest.raises(ValueError, match=message):
+        env.reset(options=options)
+    env.close()
+
+
+def test_bad_actions_are_refused(env):
+    env.reset(seed=0)
+    size = env.action_space.shape[0]
+    with pytest.raises(ValueError, match="finite"):
+        env.step(np.full(size, np.nan))
+    with pytest.raises(ValueError, match="finite"):
+        env.step(np.full(size, np.inf))
+    with pytest.raises(ValueError, match=rf"shape \({size},\), not \({size + 1},\)"):
+        env.step(np.zeros(size + 1))
+
+
+def explode(env) -> None:
+    robot, client = body(env)
+    for joint in range(pybullet.getNumJoints(robot, physicsClientId=client)):
+        pybullet.resetJointState(robot, joint, math.nan, math.nan, physicsClientId=client)
+
+
+def test_a_world_that_explodes_ends_its_episode_and_the_next_one_is_sound(env):
+    expected = roll(env, 5)
+    env.reset(seed=0)
+    before = env.step(np.zeros(env.action_space.shape))[0]
+    explode(env)
+    observation, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
+    assert info == {"error": "the state of the world is not finite"}
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    np.testing.assert_array_equal(observation, before)
+    np.testing.assert_array_equal(roll(env, 5), expected)
+
+
+def test_training_goes_on_after_an_explosion():
+    worlds = VectorWorlds([Ant(), Ant()], max_episode_steps=50)
+    worlds.reset([0, 1])
+    explode(worlds.envs[1])
+    observations, rewards, ended = worlds.step(np.zeros((2, 8)))
+    assert [end.world for end in ended] == [1]
+    assert not ended[0].terminated
+    for _ in range(5):
+        observations, rewards, ended = worlds.step(np.zeros((2, 8)))
+        assert np.isfinite(observations).all()
+        assert np.isfinite(rewards).all()
+    worlds.close()
+
+
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+def test_renders_without_a_display(name, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    env = ROBOTS[name](render_mode="rgb_array")
+    plain = ROBOTS[name]()
+    np.testing.assert_array_equal(roll(env, 1, 10), roll(plain, 1, 10))
+    image = env.render()
+    assert image.shape == (240, 320, 3)
+    assert image.dtype == np.uint8
+    assert image.std() > 1.0
+    env.close()
+    plain.close()
+
+
+def test_a_window_without_a_display_is_refused(env, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(RuntimeError, match="needs a display"):
+        type(env)(render_mode="human")
+    monkeypatch.setenv("DISPLAY", ":987")
+    with pytest.raises(RuntimeError, match="needs a display"):
+        type(env)(render_mode="human")
+
+
+def test_closing_twice_is_harmless(env):
+    env.reset(seed=0)
+    env.close()
+    env.close()
+
+
+def test_resets_do_not_grow_the_process():
+    env = Ant()
+
+    def resident() -> int:
+        with open("/proc/self/statm") as statm:
+            return int(statm.read().split()[1]) * 4096
+
+    for _ in range(50):
+        env.reset(seed=0)
+    before = resident()
+    for _ in range(200):
+        env.reset(seed=0)
+    env.close()
+    assert resident() - before < 8 * 2**20

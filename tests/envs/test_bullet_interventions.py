@@ -1,0 +1,261 @@
+"""Each intervention does to the physics what its name says, and refuses absurd values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+from bullet_robots import ROBOTS, body, total_mass
+
+from irlcli.envs.bullet.ant import Ant
+from irlcli.envs.bullet.half_cheetah import HalfCheetah
+from irlcli.envs.bullet.reacher import Reacher
+from irlcli.envs.bullet.world import GRAVITY
+
+
+def started(env, **options):
+    env.reset(seed=0, **options)
+    return env
+
+
+@pytest.mark.parametrize("robot", [Ant, HalfCheetah])
+@pytest.mark.parametrize("model", ["merged", "original"])
+def test_mass_multiplies_every_link(robot, model):
+    masses, inertias = [], []
+    for factor in (1.0, 4.0):
+        env = started(robot(mass=factor, model=model))
+        masses.append(total_mass(env))
+        number, client = body(env)
+        last = pybullet.getNumJoints(number, physicsClientId=client) - 1
+        inertias.append(pybullet.getDynamicsInfo(number, last, physicsClientId=client)[2])
+        env.close()
+    assert masses[1] == pytest.approx(4.0 * masses[0])
+    np.testing.assert_allclose(inertias[1], 4.0 * np.array(inertias[0]))
+
+
+def test_ant_weighs_what_its_volume_says():
+    env = started(Ant())
+    torso = 1000.0 * 4.0 / 3.0 * math.pi * 0.25**3
+    capsule = [
+        1000.0 * math.pi * 0.08**2 * (math.sqrt(2) * length + 4.0 / 3.0 * 0.08)
+        for length in (0.2, 0.4)
+    ]
+    assert total_mass(env) == pytest.approx(torso + 8 * capsule[0] + 4 * capsule[1], rel=1e-6)
+    env.close()
+
+
+def sliding_distance(friction: float) -> float:
+    """How far an Ant lying on its belly slides from 3 m/s with its joints held still."""
+    env = started(Ant(friction=(friction, 0.0, 0.0)))
+    robot, client = body(env)
+    lifted = [0.0, 0.5236, 0.0, -0.5236, 0.0, -0.5236, 0.0, 0.5236]
+    for joint, angle in enumerate(lifted):
+        pybullet.setJointMotorControl2(
+            robot, joint, pybullet.POSITION_CONTROL, angle, force=1e4, physicsClientId=client
+        )
+        pybullet.resetJointState(robot, joint, angle, physicsClientId=client)
+    for _ in range(120):
+        env._world.step()
+    start = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)[0]
+    pybullet.resetBaseVelocity(robot, (3.0, 0.0, 0.0), physicsClientId=client)
+    for _ in range(240):
+        env._world.step()
+    end = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)[0]
+    env.close()
+    return math.dist(start[:2], end[:2])
+
+
+def test_friction_shortens_a_slide():
+    """A block at v slides v^2 / (2 mu g); Bullet multiplies mu by the floor's 0.8."""
+    slippery, rough = sliding_distance(0.25), sliding_distance(0.5)
+    expected = 3.0**2 / (2.0 * 0.8 * 0.5 * GRAVITY)
+    assert rough == pytest.approx(expected, rel=0.3)
+    assert slippery / rough == pytest.approx(2.0, rel=0.3)
+
+
+@pytest.mark.parametrize("robot", [Ant, HalfCheetah])
+def test_friction_reaches_every_link(robot):
+    env = started(robot(friction=(2.5, 0.7, 0.6)))
+    number, client = body(env)
+    for link in range(-1, pybullet.getNumJoints(number, physicsClientId=client)):
+        info = pybullet.getDynamicsInfo(number, link, physicsClientId=client)
+        assert (info[1], info[6], info[7]) == pytest.approx((2.5, 0.6, 0.7))
+    env.close()
+
+
+def test_leg_length_stretches_the_ants_hind_legs_only():
+    reach = []
+    for scale in (1.0, 3.0):
+        env = started(Ant(leg_length=scale), options={"joint_positions": [0.0] * 8})
+        robot, client = body(env)
+        boxes = [pybullet.getAABB(robot, link, physicsClientId=client) for link in (1, 5)]
+        reach.append((boxes[0][1][1], -boxes[1][0][1]))
+        env.close()
+    (front, hind), (front_3x, hind_3x) = reach
+    assert front_3x == pytest.approx(front)
+    assert front == pytest.approx(hind, abs=1e-6)
+    # Both segments, 0.2 and 0.4 along y, grow by two of themselves.
+    assert hind_3x - hind == pytest.approx(2.0 * (0.2 + 0.4), abs=0.02)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 1.5])
+def test_leg_length_stretches_both_legs_of_the_half_cheetah(scale):
+    env = started(HalfCheetah(leg_length=scale), options={"joint_positions": [0.0] * 9})
+    robot, client = body(env)
+    joints = [
+        np.array(pybullet.getLinkState(robot, link, physicsClientId=client)[4])
+        for link in range(3, 9)
+    ]
+    for hip in (0, 3):
+        thigh, shin, foot = joints[hip : hip + 3]
+        lengths = [np.linalg.norm(shin - thigh), np.linalg.norm(foot - shin)]
+        original = [math.hypot(0.16, 0.25), math.hypot(0.28, 0.14)]
+        if hip == 3:
+            original = [math.hypot(0.14, 0.24), math.hypot(0.13, 0.18)]
+        np.testing.assert_allclose(lengths, scale * np.array(original), rtol=1e-6)
+    lowest = min(
+        pybullet.getAABB(robot, link, physicsClientId=client)[0][2] for link in range(3, 9)
+    )
+    reference = started(HalfCheetah(), options={"joint_positions": [0.0] * 9})
+    number, other = body(reference)
+    clearance = min(
+        pybullet.getAABB(number, link, physicsClientId=other)[0][2] for link in range(3, 9)
+    )
+    assert lowest == pytest.approx(clearance, abs=0.05)
+    env.close()
+    reference.close()
+
+
+@pytest.mark.parametrize("model", ["merged", "original"])
+def test_gravity_sets_the_static_torque_on_the_shoulder(model):
+    """The stretched arm hangs on its bearing with the moment of its weight."""
+    moments = []
+    for gravity in (1.0, 2.0, 4.0):
+        env = started(Reacher(gravity=gravity, model=model), options={"joint_positions": [0] * 4})
+        arm, client = body(env)
+        pybullet.enableJointForceTorqueSensor(arm, 0, True, physicsClientId=client)
+        env.step(np.zeros(2))
+        wrench = pybullet.getJointState(arm, 0, physicsClientId=client)[2]
+        moments.append(math.hypot(wrench[3], wrench[4]))
+        if model == "merged":
+            # Bullet reports the moment about the upper arm's centre of mass.
+            mass, *_ = pybullet.getDynamicsInfo(arm, 1, physicsClientId=client)
+            lever = 0.05 + pybullet.getDynamicsInfo(arm, 1, physicsClientId=client)[3][0]
+            assert moments[-1] == pytest.approx(mass * gravity * GRAVITY * lever, rel=1e-5)
+        env.close()
+    assert moments[1] == pytest.approx(2.0 * moments[0], rel=1e-3)
+    assert moments[2] == pytest.approx(4.0 * moments[0], rel=1e-3)
+
+
+def test_gravity_cannot_turn_the_reachers_vertical_joints():
+    action = np.array([0.3, -0.2])
+    paths = []
+    for gravity in (0.0, 4.0):
+        env = started(Reacher(gravity=gravity))
+        paths.append([env.step(action)[0] for _ in range(50)])
+        env.close()
+    np.testing.assert_allclose(paths[0], paths[1], atol=1e-6)
+
+
+def glide(env, heading: float) -> float:
+    """Progress of one step of an Ant in the air that moves at 1 m/s in a direction (degrees)."""
+    robot, client = body(env)
+    pybullet.resetBasePositionAndOrientation(
+        robot, (0, 0, 20), (0, 0, 0, 1), physicsClientId=client
+    )
+    velocity = math.cos(math.radians(heading)), math.sin(math.radians(heading)), 0.0
+    pybullet.resetBaseVelocity(robot, velocity, (0, 0, 0), physicsClientId=client)
+    env.step(np.zeros(8))
+    return env.step(np.zeros(8))[4]["progress"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "heading"),
+    [
+        ({}, 0.0),
+        ({"goal_y": 900.0}, 41.987),
+        ({"goal_y": -900.0}, -41.987),
+        ({"direction": 10.0}, 10.0),
+    ],
+)
+def test_progress_rewards_a_straight_walk_to_the_goal(arguments, heading):
+    progress = {}
+    for offset in (0.0, 60.0, 90.0):
+        env = started(Ant(**arguments), options={"joint_positions": [0, 1, 0, -1, 0, -1, 0, 1]})
+        progress[offset] = glide(env, heading + offset)
+        env.close()
+    # The floor counts as one of the 22 parts whose mean is taken.
+    assert progress[0.0] == pytest.approx(21 / 22, abs=0.01)
+    assert progress[60.0] == pytest.approx(0.5 * 21 / 22, abs=0.01)
+    assert progress[90.0] == pytest.approx(0.0, abs=0.01)
+
+
+def test_half_cheetahs_progress_is_its_velocity_along_the_goal():
+    straight = started(HalfCheetah())
+    aside = started(HalfCheetah(direction=60.0))
+    action = np.full(6, 0.5)
+    for _ in range(5):
+        first, second = straight.step(action)[4], aside.step(action)[4]
+        assert second["progress"] == pytest.approx(0.5 * first["progress"])
+        assert second["control"] == pytest.approx(-0.1 * 6 * 0.25)
+    straight.close()
+    aside.close()
+
+
+@pytest.mark.parametrize("robot", [Ant, HalfCheetah])
+def test_a_range_of_directions_is_drawn_per_episode_and_observed(robot):
+    env = robot(direction=(-10.0, 0.0))
+    angles = []
+    for seed in range(20):
+        observation, _ = env.reset(seed=seed)
+        angles.append(math.degrees(math.atan2(observation[-1], observation[-2])))
+    assert min(angles) >= -10.0 - 1e-4
+    assert max(angles) <= 1e-4
+    assert np.std(angles) > 1.0
+    again, _ = env.reset(seed=0)
+    assert math.degrees(math.atan2(again[-1], again[-2])) == pytest.approx(angles[0])
+    env.close()
+
+
+@pytest.mark.parametrize("robot", [Ant, HalfCheetah])
+def test_the_goal_is_observed_only_where_it_varies(robot):
+    plain, zero = robot(), robot(goal_y=0.0)
+    assert zero.observation_space.shape[0] == plain.observation_space.shape[0] + 2
+    np.testing.assert_allclose(zero.reset(seed=0)[0][-2:], [1.0, 0.0])
+    plain.close()
+    zero.close()
+
+
+@pytest.mark.parametrize(
+    ("robot", "arguments", "message"),
+    [
+        ("ant", {"mass": 0.0}, r"mass must lie in \[0.1, 10\], not 0.0"),
+        ("ant", {"mass": -1.0}, "mass must lie in"),
+        ("ant", {"mass": math.nan}, "mass must lie in"),
+        ("ant", {"mass": "heavy"}, "mass must lie in .* not 'heavy'"),
+        ("ant", {"leg_length": 0.0}, r"leg_length must lie in \[0.2, 5\], not 0.0"),
+        ("ant", {"friction": (1.0, -0.1, 0.0)}, r"friction \(torsional\) must lie in \[0, 10\]"),
+        ("ant", {"friction": 1.0}, "friction must be three numbers"),
+        ("ant", {"goal_y": math.inf}, "goal_y must lie in"),
+        ("ant", {"direction": 200.0}, r"direction must lie in \[-180, 180\], not 200"),
+        ("ant", {"direction": (0.0, -10.0)}, r"\(smaller, larger\)"),
+        ("ant", {"direction": (0.0, 1.0, 2.0)}, "one angle or a pair"),
+        ("ant", {"direction": 0.0, "goal_y": 0.0}, "exclude each other"),
+        ("ant", {"model": "copy"}, "'merged' or 'original'"),
+        ("ant", {"model": "original", "leg_length": 2.0}, "leg_length must be 1"),
+        ("ant", {"render_mode": "ansi"}, "render_mode must be"),
+        ("half_cheetah", {"leg_length": -1.0}, "leg_length must lie in"),
+        ("half_cheetah", {"mass": 1e9}, "mass must lie in"),
+        ("reacher", {"gravity": -1.0}, r"gravity must lie in \[0, 20\], not -1.0"),
+    ],
+)
+def test_absurd_values_are_refused(robot, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ROBOTS[robot](**arguments)
+
+
+def test_unknown_interventions_are_refused():
+    with pytest.raises(TypeError):
+        Reacher(mass=2.0)

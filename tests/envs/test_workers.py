@@ -1,0 +1,207 @@
+"""Worker processes: the same numbers as one process, and no silent or lasting failure."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from irlcli.envs.bullet.half_cheetah import HalfCheetah
+from irlcli.envs.vector import VectorWorlds
+from irlcli.envs.workers import WorkerFailed, WorkerWorlds
+
+SEEDS = [3, 1, 4]
+FACTORIES = [
+    HalfCheetah,
+    partial(HalfCheetah, mass=2.0),
+    partial(HalfCheetah, leg_length=1.3),
+]
+
+
+class Fragile(gymnasium.Env):
+    """Counts its steps; raises, or kills its process, at a given one."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, fail_at: int = -1, die_at: int = -1):
+        self.fail_at = fail_at
+        self.die_at = die_at
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == self.fail_at:
+            raise ArithmeticError("the sums do not add up")
+        if self.steps == self.die_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.full(1, self.steps, dtype=np.float32), float(action), False, False, {}
+
+
+def alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_for_death(pids: list[int], seconds: float = 10.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while any(alive(pid) for pid in pids):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def roll_out(worlds, steps: int = 12) -> list:
+    random = np.random.default_rng(0)
+    out = [worlds.reset(SEEDS)]
+    for _ in range(steps):
+        observations, rewards, ended = worlds.step(random.normal(size=(3, 6)) * 0.5)
+        assert observations.dtype == np.float32
+        assert rewards.dtype == np.float64
+        out += [observations, rewards]
+        for end in ended:
+            assert end.length == 5
+            out += [end.world, end.final_observation, end.terminated, end.episode_return]
+    worlds.close()
+    return out
+
+
+def test_numbers_do_not_depend_on_the_number_of_workers():
+    expected = roll_out(VectorWorlds([make() for make in FACTORIES], max_episode_steps=5))
+    for workers in (1, 2, 3):
+        actual = roll_out(WorkerWorlds(FACTORIES, max_episode_steps=5, workers=workers))
+        assert len(actual) == len(expected)
+        for a, b in zip(actual, expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_has_the_worlds_spaces_and_length():
+    worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
+    assert len(worlds) == 3
+    assert worlds.observation_space.shape == (17,)
+    assert worlds.action_space.shape == (6,)
+    worlds.close()
+    worlds.close()
+
+
+def test_steps_discrete_actions():
+    worlds = WorkerWorlds([Fragile, Fragile], max_episode_steps=100, workers=2)
+    worlds.reset([0, 0])
+    observations, rewards, ended = worlds.step(np.array([0, 1]))
+    assert observations.tolist() == [[1.0], [1.0]]
+    assert rewards.tolist() == [0.0, 1.0]
+    assert ended == []
+    worlds.close()
+
+
+def test_an_environments_error_names_worker_and_worlds():
+    worlds = WorkerWorlds(
+        [Fragile, Fragile, partial(Fragile, fail_at=2)], max_episode_steps=100, workers=2
+    )
+    pids = [process.pid for process in worlds._processes]
+    worlds.reset([0, 0, 0])
+    worlds.step(np.zeros(3, dtype=np.int64))
+    message = r"worker 1 \(worlds 1 to 2\): ArithmeticError: the sums do not add up"
+    with pytest.raises(WorkerFailed, match=message):
+        worlds.step(np.zeros(3, dtype=np.int64))
+    assert wait_for_death(pids)
+    with pytest.raises(WorkerFailed, match="closed"):
+        worlds.step(np.zeros(3, dtype=np.int64))
+
+
+def test_a_dead_worker_is_noticed_and_the_others_are_ended():
+    worlds = WorkerWorlds([Fragile, partial(Fragile, die_at=2)], max_episode_steps=100, workers=2)
+    pids = [process.pid for process in worlds._processes]
+    worlds.reset([0, 0])
+    worlds.step(np.zeros(2, dtype=np.int64))
+    with pytest.raises(WorkerFailed, match=r"worker 1 \(world 1\) died: signal 9"):
+        worlds.step(np.zeros(2, dtype=np.int64))
+    assert wait_for_death(pids)
+
+
+PARENT = """
+import sys, time
+sys.path.insert(0, {here!r})
+import numpy as np
+from test_workers import Fragile
+from irlcli.envs.workers import WorkerWorlds
+
+if __name__ == "__main__":
+    worlds = WorkerWorlds([Fragile] * 2, max_episode_steps=100, workers=2)
+    worlds.reset([0, 0])
+    print(*[process.pid for process in worlds._processes], flush=True)
+    while True:
+        worlds.step(np.zeros(2, dtype=np.int64))
+"""
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_worker_outlives_its_parent(stop, tmp_path):
+    here = Path(__file__).parent
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT.format(here=str(here)))
+    parent = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[1]), *sys.path])},
+        start_new_session=True,
+    )
+    pids = [int(pid) for pid in parent.stdout.readline().split()]
+    assert len(pids) == 2
+    assert all(alive(pid) for pid in pids)
+    if stop == signal.SIGINT:
+        os.killpg(parent.pid, stop)  # as a terminal's Ctrl-C does
+    else:
+        os.kill(parent.pid, stop)
+    parent.wait(timeout=20)
+    assert wait_for_death(pids)
+    assert "Process" not in parent.stderr.read()
+    parent.stdout.close()
+    parent.stderr.close()
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((3, 5)), r"shape \(3, 6\), not \(3, 5\)"),
+        (np.full((3, 6), np.nan), "finite"),
+    ],
+)
+def test_bad_actions_are_refused_and_the_workers_go_on(actions, message):
+    worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
+    worlds.reset(SEEDS)
+    with pytest.raises(ValueError, match=message):
+        worlds.step(actions)
+    worlds.step(np.zeros((3, 6)))
+    worlds.close()
+
+
+@pytest.mark.parametrize("workers", [0, 4])
+def test_a_senseless_number_of_workers_is_refused(workers):
+    with pytest.raises(ValueError, match=rf"\[1, 3\], not {workers}"):
+        WorkerWorlds(FACTORIES, max_episode_steps=5, workers=workers)
+
+
+def test_a_wrong_number_of_seeds_is_refused():
+    worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
+    with pytest.raises(ValueError, match="3 seeds are needed, not 2"):
+        worlds.reset([0, 1])
+    worlds.close()
