@@ -61,7 +61,8 @@ class Session:
         if name is not None:
             # Before the work, not after it.
             self.store.check_name(name)
-        runner = Runner(self.store, self._console, self._wait, workers=self._workers)
+        command = ["irl", *sys.argv[1:]]
+        runner = Runner(self.store, self._console, self._wait, command, workers=self._workers)
         if self._dry_run:
             self._print_plan([step for request in requests for step in runner.plan(request)])
             return []
@@ -746,7 +747,12 @@ def main() -> None:
     garbage_collector.disable()
     as_json = "--json" in sys.argv
     try:
-        build_app(sys.argv[1:])(standalone_mode=False)
+        # Without arguments, what there is to ask for; typer would call that an error.
+        arguments = sys.argv[1:] or ["--help"]
+        # Typer catches a KeyboardInterrupt itself and returns its exit code.
+        code = build_app(arguments)(arguments, standalone_mode=False)
+        if code == Interrupted.exit_code:
+            raise KeyboardInterrupt
     except KeyboardInterrupt:
         _fail(Interrupted("interrupted", "run the same command again to go on"), as_json)
     except IrlError as error:

@@ -111,6 +111,8 @@ class Subject(Struct, frozen=True, kw_only=True):
     agent: Agent
     env: str
     method: Method | None = None
+    seed: int | None = None
+    reward_seed: int | None = None
 
 
 class Returns(Struct, frozen=True, kw_only=True):

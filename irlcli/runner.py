@@ -7,7 +7,6 @@ import gc
 import hashlib
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -85,7 +84,7 @@ class Runner:
         store: a store or its directory.
         console: told of progress; silent by default.
         wait: wait for another process that makes the same artefact, instead of failing.
-        command: the command line to record; ``sys.argv`` by default.
+        command: the command line to record, so that a damaged artefact can say how to repair it.
         checkpoint_seconds: least time between two checkpoints [s].
         workers: processes that step the environments; no part of any artefact's identity.
     """
@@ -102,7 +101,7 @@ class Runner:
         self.store = store if isinstance(store, Store) else Store(store)
         self.console = console if console is not None else Silent()
         self.wait = wait
-        self.command = command if command is not None else ["irl", *sys.argv[1:]]
+        self.command = command or []
         self.checkpoint_seconds = checkpoint_seconds
         self.workers = workers
 
@@ -194,6 +193,7 @@ class Runner:
             self.console.start(request.label, checkpoints.load() is not None)
             output = scratch.new_output()
             started = time.time()
+            git = _git_state()
             with checkpoints.listening():
                 request.stage.run(
                     Job(
@@ -205,7 +205,7 @@ class Runner:
                         self.workers,
                     )
                 )
-            provenance = self._provenance(sources, started, checkpoints.resumed)
+            provenance = self._provenance(sources, started, checkpoints.resumed, git)
             published = self.store.publish(record, output, provenance)
         if published.diverged is not None:
             self.console.warn(
@@ -213,11 +213,21 @@ class Runner:
                 f"key: this result is kept as {published.artefact.id}"
             )
         self.console.finish(published.artefact, hit=False)
+        if checkpoints.stop_requested:
+            # A stage without rounds ends before it can answer the signal; what follows must not run.
+            raise Interrupted(
+                f"stopped after {request.label}", "run the same command again to go on from it"
+            )
         return published.diverged or published.artefact
 
     def _checked(self, source: Source) -> Path:
         """The path of an input whose bytes are what the key says."""
         if source.artefact is None:
+            # It was hashed when the run was planned, which may be hours ago.
+            if source_of(Resolved(None, source.path)).sha256 != source.sha256:
+                raise IntegrityError(
+                    f"{source.path} changed since it was asked for", "run the same command again"
+                )
             return source.path
         if source.path != source.artefact.directory:
             relative = source.path.relative_to(source.artefact.directory).as_posix()
@@ -227,14 +237,18 @@ class Runner:
         return source.path
 
     def _provenance(
-        self, sources: Mapping[str, Source], started: float, resumed: int
+        self,
+        sources: Mapping[str, Source],
+        started: float,
+        resumed: int,
+        git: dict[str, str | None],
     ) -> dict[str, Any]:
         # Imported here and below: a hit does without, and they take longer than it does.
         import platform
 
         return {
             "command": self.command,
-            "git": _git_state(),
+            "git": git,
             "libraries": {name: _version(name) for name in ("irlcli", *_LIBRARIES)},
             "python": platform.python_version(),
             "platform": platform.platform(),
@@ -260,7 +274,7 @@ class _Checkpoints:
         self._console = console
         self._seconds = seconds
         self._last = time.monotonic()
-        self._stop = False
+        self.stop_requested = False
         self._state: bytes | None = None
         self.resumed = 0
         try:
@@ -278,10 +292,10 @@ class _Checkpoints:
 
     def offer(self, state: Callable[[], bytes]) -> None:
         now = time.monotonic()
-        if self._stop or now - self._last >= self._seconds:
+        if self.stop_requested or now - self._last >= self._seconds:
             self._scratch.save(self.resumed.to_bytes(4, "big") + state())
             self._last = now
-        if self._stop:
+        if self.stop_requested:
             raise Interrupted(
                 "stopped; a checkpoint was written", "run the same command again to go on from it"
             )
@@ -294,9 +308,9 @@ class _Checkpoints:
             return
 
         def handle(number: int, frame: Any) -> None:
-            if self._stop:
+            if self.stop_requested:
                 raise KeyboardInterrupt
-            self._stop = True
+            self.stop_requested = True
             self._console.warn("stopping at the end of this round (once more to stop at once)")
 
         previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}

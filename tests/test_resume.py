@@ -127,6 +127,53 @@ def test_ctrl_c_leaves_a_checkpoint_and_exit_130(tmp_path):
     assert "BLOCKED collect-experts" in plan
 
 
+def interrupted(arguments, count):
+    """Exit code and stderr of a command that gets ``count`` SIGINTs once it is at work."""
+    process = subprocess.Popen(
+        irl(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    line = process.stderr.readline()
+    while not line.startswith("RUN"):
+        line = process.stderr.readline()
+    time.sleep(3.0)  # past the imports, into the episodes
+    for _ in range(count):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.05)
+    _, errors = process.communicate(timeout=120)
+    return process.returncode, errors
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count):
+    arguments = ["evaluate", "--random", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
+    arguments += ["--episodes", "3000", "--store", str(tmp_path / "runs")]
+    code, errors = interrupted(arguments, count)
+    assert code == 130
+    assert "error:" in errors and "hint:" in errors and "Traceback" not in errors
+
+
+def test_a_foreign_input_that_changes_after_planning_is_noticed(tmp_path):
+    from irlcli.errors import IntegrityError
+    from irlcli.interventions import parse_settings
+    from irlcli.runner import source_of
+    from irlcli.settings import load_settings
+    from irlcli.stages import evaluate
+    from irlcli.store import Resolved
+
+    path = tmp_path / "policy.pt"
+    path.write_bytes(b"one")
+    config = load_settings("lunar-lander", "smoke")
+    request = evaluate.request(
+        "lunar-lander",
+        parse_settings("lunar-lander", "bounce=0.9"),
+        config.evaluation,
+        source_of(Resolved(None, path)),
+    )
+    path.write_bytes(b"two")
+    with pytest.raises(IntegrityError, match=r"policy\.pt changed"):
+        Runner(tmp_path / "runs").run(request)
+
+
 def test_a_damaged_checkpoint_is_said_aloud_and_not_used(tmp_path):
     process = start(tmp_path, "collect-experts")
     assert kill_after_checkpoint(tmp_path, process)

@@ -7,7 +7,8 @@ Absorbing states. Where episodes may end early, the sign of a learned reward alo
 the task (Kostrikov et al. 2019). With an absorbing state after termination and the time limit
 bootstrapped through, as a truncation is, the value of the state that ended the episode is the
 geometric series f_abs / (1 - gamma): it is added in closed form instead of being stepped
-through, and the discriminator sees each absorbing state as often as stepping would show it.
+through, and the discriminator sees each absorbing state as often as stepping on to the horizon would show
+it. (Episodes that a round cuts off never get that far: their absorbing states go unseen.)
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from irlcli.descriptions import Evaluation, Subject
+from irlcli.errors import UsageError
 
 _ORDER = ("expert", "student", "transfer", "random", "idle")
 _WHAT = {"student": "zero-shot", "transfer": "transfer"}
@@ -38,7 +39,12 @@ def rows(summaries: Iterable[Evaluation]) -> list[Row]:
     """Rows of evaluation summaries (``summary.json``), one per agent, method and setting.
 
     Experts first, random and idle last.
+
+    Raises:
+        UsageError: one seed of the reward learning twice in a row: the same evaluation again, or
+            runs that differ in something no row shows.
     """
+    seen: set[tuple] = set()
     groups: dict[tuple[int, str, str, str], list[tuple[float, int, float | None]]] = {}
     for summary in summaries:
         policy = summary.policy
@@ -46,6 +52,13 @@ def rows(summaries: Iterable[Evaluation]) -> list[Row]:
         for item in summary.settings:
             key = (order, agent_name(policy), policy.env, item.setting)
             values = item.mean_return, item.episodes, item.mean_progress
+            seed = policy.seed if policy.reward_seed is None else policy.reward_seed
+            if (*key, seed) in seen:
+                raise UsageError(
+                    f"{agent_name(policy)} in {item.setting} has seed {seed} twice",
+                    "a row's sample is the seed: report runs that differ in anything else apart",
+                )
+            seen.add((*key, seed))
             groups.setdefault(key, []).append(values)
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):

@@ -5,11 +5,14 @@ from typing import Literal
 
 import msgspec
 
+from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.settings import EvaluationSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
 Agent = Literal["policy", "random", "idle"]
+# Sets the seeds of evaluation apart from those of demonstrations.
+_EPISODES = 0xE7A1
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -35,9 +38,14 @@ def request(
     Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
 
     Raises:
-        UsageError: a tabular environment.
+        UsageError: a tabular environment, or a policy missing or too many.
     """
     check_tabular(env, "evaluate", wanted=False)
+    if (agent == "policy") != (policy is not None):
+        raise UsageError(
+            f"agent {agent!r} {'needs a' if policy is None else 'takes no'} policy",
+            "give a policy, or name the random or the idle agent",
+        )
     texts = tuple(str(s) for s in settings_)
     parameters = Parameters(env=env, settings=texts, agent=agent, seed=seed, evaluation=evaluation)
     inputs = {} if policy is None else {"policy": policy}
@@ -63,7 +71,8 @@ def run(job: Job) -> None:
         del subject["network"]
     rows, summary = [], []
     for index, text in enumerate(p.settings):
-        seed = int(np.random.SeedSequence([p.seed, index]).generate_state(1)[0])
+        # The same initial states in every setting, and none that demonstrations started from.
+        seed = int(np.random.SeedSequence([p.seed, _EPISODES]).generate_state(1)[0])
         trajectories = rl.roll_out(
             p.env,
             parse_setting(p.env, text),
@@ -105,4 +114,4 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", {"policy": subject, "settings": summary})
 
 
-STAGE = Stage("evaluate", 1, run)
+STAGE = Stage("evaluate", 2, run)

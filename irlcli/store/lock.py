@@ -56,7 +56,8 @@ def is_locked(path: Path) -> bool:
     if not path.exists():
         return False
     try:
-        with locked(path):
+        # Shared: a probe must neither look like a holder nor write itself down as one.
+        with locked(path, shared=True):
             return False
     except Busy:
         return True

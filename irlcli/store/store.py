@@ -195,7 +195,7 @@ class Store:
             name = pointer.read_text("ascii").strip()
         except FileNotFoundError:
             return None
-        except (UnicodeDecodeError, OSError):
+        except (UnicodeDecodeError, IsADirectoryError):
             name = ""
         if not re.fullmatch(_ID, name) or not (self.root / name).is_dir():
             # The artefact was removed, or the pointer damaged: computing again repairs both.

@@ -1,0 +1,37 @@
+"""Rows of true returns: the sample is the seed, and no seed counts twice."""
+
+import pytest
+
+from irlcli.descriptions import Evaluation, Returns, Subject
+from irlcli.errors import UsageError
+from irlcli.report.returns import rows
+
+
+def evaluation(agent, mean, seed=None, **subject):
+    return Evaluation(
+        policy=Subject(agent=agent, env="lunar-lander", seed=seed, **subject),
+        settings=(Returns(setting="bounce=0.9", episodes=20, mean_return=mean),),
+    )
+
+
+def test_statistics_are_over_seeds():
+    found = rows(
+        [
+            evaluation("random", -200.0),
+            *(
+                evaluation("transfer", mean, 0, method="irm", reward_seed=seed)
+                for seed, mean in enumerate((1.0, 3.0, 8.0))
+            ),
+            evaluation("expert", 250.0, 0),
+        ]
+    )
+    assert [row.agent for row in found] == ["expert", "airl-irm transfer", "random"]
+    assert found[1].mean == 4.0
+    assert found[1].deviation == pytest.approx(13.0**0.5)
+    assert found[0].deviation is None
+
+
+def test_a_seed_that_comes_twice_is_refused():
+    twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
+    with pytest.raises(UsageError, match="airl-erm zero-shot in bounce=0.9 has seed 3 twice"):
+        rows(twice)
