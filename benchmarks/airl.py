@@ -38,10 +38,10 @@ def main() -> None:
     # Random demonstrations cost as much to learn from as an expert's.
     demos = Demonstrations(
         arguments.env,
-        {str(s): tuple(rl.roll_out(arguments.env, s, "random", 10, 0)) for s in settings},
+        {str(s): tuple(rl.roll_out(arguments.env, s, "random", 10, 0, "bench")) for s in settings},
         {},
     )
-    trainer = rl.PPOTrainer(worlds, config.ppo, config.total_steps, 0)
+    trainer = rl.PPOTrainer(worlds, config.ppo, config.total_steps, 0, "bench")
     adversary = Adversary(demos, config, worlds, 0)
 
     seconds: dict[str, float] = defaultdict(float)

@@ -46,7 +46,7 @@ class Session:
         self._dry_run = dry_run
         self._wait = wait
         self._workers = workers
-        self._console = out.TerminalConsole(quiet, tensorboard)
+        self.console = out.TerminalConsole(quiet, tensorboard)
 
     def settings(self, env: str, flags: dict[str, Any] | None = None):
         """Settings of ``env`` under this session's options."""
@@ -62,7 +62,7 @@ class Session:
             # Before the work, not after it.
             self.store.check_name(name)
         command = ["irl", *sys.argv[1:]]
-        runner = Runner(self.store, self._console, self._wait, command, workers=self._workers)
+        runner = Runner(self.store, self.console, self._wait, command, workers=self._workers)
         if self._dry_run:
             self._print_plan([step for request in requests for step in runner.plan(request)])
             return []
@@ -71,7 +71,7 @@ class Session:
             for request in requests:
                 artefacts.append(runner.run(request))
         finally:
-            self._console.close()
+            self.console.close()
         if name is not None:
             self.store.set_name(name, artefacts[0])
         for artefact in artefacts:
@@ -178,14 +178,30 @@ def collect_experts(
     config = session.settings(env)
     settings = _settings(env, config, intervention, "id")
     counts = None if episodes is None else _counts(episodes)
-    session.deliver([collect_experts.request(env, settings, config, seed, counts)], name)
+    request = collect_experts.request(env, settings, config, seed, counts)
+    for artefact in session.deliver([request], name):
+        _warn_of_missed_bars(session, artefact, config.expert.bar)
+
+
+def _warn_of_missed_bars(session: Session, artefact: Any, bar: float | None) -> None:
+    from irlcli.store import read_json
+
+    summary = read_json(session.store.open(artefact, "summary.json"))
+    for row in summary["settings"]:
+        if bar is not None and row["mean_return"] < bar:
+            session.console.warn(
+                f"the expert of {summary['env']} {row['setting']} misses its bar: mean true "
+                f"return {row['mean_return']:.0f} over {row['episodes']} episodes, bar {bar:.0f}"
+            )
 
 
 @command("train-airl")
 def train_airl(
     session: Session,
     demos: Annotated[str, typer.Option(help="Demonstrations: an artefact.")],
-    method: Annotated[str | None, typer.Option(help="erm, erm-balanced or irm.")] = None,
+    method: Annotated[
+        str | None, typer.Option(help="erm, erm-balanced, irm or irm-shuffled.")
+    ] = None,
     penalty_weight: Annotated[float | None, typer.Option(help="lambda of IRM.")] = None,
     state_only: Annotated[bool, typer.Option("--state-only", help="g(s), not g(s, a).")] = False,
     seed: Seed = 0,

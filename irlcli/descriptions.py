@@ -14,6 +14,7 @@ from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import environment, parse_setting
 from irlcli.settings import (
     Activation,
+    AdversarialMethod,
     AIRLSettings,
     Discount,
     Finite,
@@ -49,7 +50,7 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 
     env: str
     settings: Settings
-    method: Method
+    method: AdversarialMethod
     seed: int
     airl: AIRLSettings
     network: RewardNetwork
@@ -93,7 +94,7 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     settings: Settings
     seed: int
     network: PolicyNetwork
-    method: Method | None = None
+    method: AdversarialMethod | None = None
     reward_seed: int | None = None
     reward_settings: tuple[str, ...] | None = None
 
@@ -110,7 +111,7 @@ class Subject(Struct, frozen=True, kw_only=True):
 
     agent: Agent
     env: str
-    method: Method | None = None
+    method: AdversarialMethod | None = None
     seed: int | None = None
     reward_seed: int | None = None
 

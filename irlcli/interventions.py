@@ -76,6 +76,7 @@ class Environment(NamedTuple):
     """What the program knows of an environment without importing it.
 
     ``tabular``: solved exactly; experts come from value iteration, rewards from train-maxent.
+    ``physics`` counts the changes that altered what happens in it: part of every artefact's key.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Environment(NamedTuple):
     max_episode_steps: int
     knobs: dict[str, Knob]
     tabular: bool = False
+    physics: int = 1
 
 
 _FRICTION = "tangential, torsional and rolling friction of the robot's links"

@@ -32,6 +32,7 @@ from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
 from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import Setting, environment
+from irlcli.seeds import derive
 from irlcli.settings import PPOSettings
 from irlcli.trajectories import Trajectory
 
@@ -172,17 +173,19 @@ class PPOTrainer:
         worlds: the environments to learn in.
         ppo: hyper-parameters.
         total_steps: environment steps the schedules run over.
-        seed: everything random in round r derives from (seed, r).
+        seed: everything random in round r derives from (purpose, seed, r).
+        purpose: the stage; stages of one seed share neither initial weights nor worlds.
 
     Raises:
         UsageError: gSDE, where actions are discrete.
     """
 
-    def __init__(self, worlds: Worlds, ppo: PPOSettings, total_steps: int, seed: int):
+    def __init__(self, worlds: Worlds, ppo: PPOSettings, total_steps: int, seed: int, purpose: str):
         torch.set_num_threads(1)
         self.ppo = ppo
         self.total_steps = total_steps
-        self.seed = seed
+        self._seed = seed
+        self._purpose = purpose
         if ppo.use_sde and isinstance(worlds.action_space, gymnasium.spaces.Discrete):
             raise UsageError("gSDE needs continuous actions", "leave ppo.use_sde unset")
         self._venv = _RecordingVecEnv(worlds)
@@ -207,7 +210,7 @@ class PPOTrainer:
                 use_sde=bool(ppo.use_sde),
                 sde_sample_freq=ppo.sde_sample_freq or -1,
                 policy_kwargs=_policy_kwargs(ppo),
-                seed=_derive(seed, -1)[0],
+                seed=derive(purpose, seed, -1)[0],
                 device="cpu",
             )
         self.model.set_logger(Logger(folder=None, output_formats=[]))
@@ -249,7 +252,9 @@ class PPOTrainer:
             raise StageFailed(str(error), "run the same command again to go on") from error
 
     def _train_round(self, index: int, reward: RewardFunction | None) -> list[Rollout]:
-        generator_seed, *world_seeds = _derive(self.seed, index, 1 + self._venv.num_envs)
+        generator_seed, *world_seeds = derive(
+            self._purpose, self._seed, index, 1 + self._venv.num_envs
+        )
         torch.manual_seed(generator_seed)
         # SB3 shuffles its minibatches by numpy's global generator.
         np.random.seed(generator_seed % 2**32)
@@ -455,12 +460,14 @@ def roll_out(
     policy: Policy | str,
     episodes: int,
     seed: int,
+    purpose: str,
     deterministic: bool = False,
     parallel: int = 16,
 ) -> list[Trajectory]:
     """``episodes`` whole episodes of ``policy`` (or ``"random"``, ``"idle"``) in one setting.
 
-    Episode k starts from its own seed derived from (seed, k), whatever the others do.
+    Episode k starts from a state of its own, derived from (purpose, seed, k). The actions of
+    the ``parallel`` episodes that run together come from one generator.
 
     Raises:
         UsageError: the setting's observations are not those the policy was trained on.
@@ -470,7 +477,7 @@ def roll_out(
     trajectories: list[Trajectory] = []
     for first in range(0, episodes, parallel):
         batch = range(first, min(first + parallel, episodes))
-        seeds = [_derive(seed, k)[0] for k in batch]
+        seeds = [derive(purpose, seed, k)[0] for k in batch]
         torch.manual_seed(seeds[0])
         rng = np.random.default_rng(seeds[0])
         worlds = [envs.make(env, setting) for _ in batch]
@@ -574,9 +581,3 @@ def _policy_kwargs(ppo: PPOSettings) -> dict[str, Any]:
 
 def _schedule(value: float, kind: str) -> float | LinearSchedule:
     return LinearSchedule(value, 0.0, 1.0) if kind == "linear" else value
-
-
-def _derive(seed: int, index: int, count: int = 1) -> list[int]:
-    """``count`` seeds below 2**31 derived from (seed, index); index -1 is the initialisation."""
-    sequence = np.random.SeedSequence([seed, index + 1])
-    return [int(x) for x in sequence.generate_state(count) % 2**31]

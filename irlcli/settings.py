@@ -34,6 +34,9 @@ Widths = Annotated[tuple[Annotated[int, Meta(ge=1, le=1024)], ...], Meta(max_len
 Schedule = Literal["constant", "linear"]
 Activation = Literal["tanh", "relu"]
 Method = Literal["erm", "erm-balanced", "irm"]
+# ``irm-shuffled`` is the control: the penalty over groups that mean nothing.
+AdversarialMethod = Literal["erm", "erm-balanced", "irm", "irm-shuffled"]
+PENALISED = ("irm", "irm-shuffled")
 
 
 class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -91,7 +94,7 @@ class DemonstrationSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Adversarial IRL (paper Sec. 4.3, Algorithm 1, App. C)."""
 
-    method: Method = "erm"
+    method: AdversarialMethod = "erm"
     total_steps: Count = 1_000_000
     state_only: bool = False
     hidden: Widths = (32, 32)

@@ -31,6 +31,7 @@ OURS = {
 NEVER = {
     "errors": HEAVY | OURS | {"numpy", "msgspec", "settings"},
     "settings": HEAVY | OURS | {"numpy"},
+    "seeds": HEAVY | OURS | {"settings", "pathlib"},
     "interventions": HEAVY | OURS | {"numpy", "settings"},
     "trajectories": HEAVY | OURS | {"settings", "pathlib"},
     "play": {"store", "irl", "stages", "cli", "console", "runner", "stable_baselines3"},

@@ -18,7 +18,7 @@ def make_trainer(seed=0, limit=None, **changes):
     worlds = rl.make_worlds("lunar-lander", SETTINGS, ppo.n_envs)
     if limit is not None:
         worlds.max_episode_steps = limit
-    return rl.PPOTrainer(worlds, ppo, 8192, seed)
+    return rl.PPOTrainer(worlds, ppo, 8192, seed, "test")
 
 
 def same(a, b):
@@ -133,7 +133,7 @@ def test_policies_survive_saving():
 @pytest.mark.parametrize("agent", ["random", "idle"])
 def test_roll_out_is_reproducible_and_whole(agent):
     first, second = (
-        rl.roll_out("lunar-lander", SETTINGS[0], agent, 3, seed=5, parallel=2) for _ in range(2)
+        rl.roll_out("lunar-lander", SETTINGS[0], agent, 3, 5, "test", parallel=2) for _ in range(2)
     )
     assert len({t.seed for t in first}) == 3
     for a, b in zip(first, second, strict=True):
@@ -147,7 +147,7 @@ def test_roll_out_is_reproducible_and_whole(agent):
 def test_idle_episode_equals_gymnasiums():
     import gymnasium
 
-    (trajectory,) = rl.roll_out("lunar-lander", SETTINGS[1], "idle", 1, seed=9)
+    (trajectory,) = rl.roll_out("lunar-lander", SETTINGS[1], "idle", 1, seed=9, purpose="test")
     env = gymnasium.make("irlcli/LunarLander-v0", engine_power=1.25)
     observation, _ = env.reset(seed=trajectory.seed)
     total = 0.0

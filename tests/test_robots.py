@@ -16,6 +16,7 @@ from irlcli.checkpoints import from_bytes, to_bytes
 from irlcli.envs.vector import VectorWorlds
 from irlcli.errors import StageFailed
 from irlcli.interventions import environment, parse_setting, parse_settings
+from irlcli.seeds import derive
 from irlcli.settings import PPOSettings, load_settings
 from irlcli.stages import From, Job, collect_experts, train_airl
 from irlcli.stages.policy_training import train_rounds
@@ -29,7 +30,7 @@ NORMALISED = {"normalise_observations": True, "normalise_rewards": True}
 def make_trainer(worlds=None, seed=0, **changes):
     ppo = PPOSettings(**{**PPO, **changes})
     worlds = worlds or rl.make_worlds("reacher", SETTINGS, ppo.n_envs)
-    return rl.PPOTrainer(worlds, ppo, 1000, seed)
+    return rl.PPOTrainer(worlds, ppo, 1000, seed, "test")
 
 
 def test_the_action_seen_by_all_is_the_unclipped_sample():
@@ -49,7 +50,7 @@ def test_the_action_seen_by_all_is_the_unclipped_sample():
     (rollout,) = rollouts
     assert np.abs(rollout.actions).max() > 2.0
     # The world moved by the clipped one.
-    _, first, _ = rl._derive(0, 0, 3)
+    _, first, _ = derive("test", 0, 0, 3)
     world = envs.make("reacher", SETTINGS[0])
     observation, _ = world.reset(seed=first)
     for t in range(20):
@@ -60,7 +61,7 @@ def test_the_action_seen_by_all_is_the_unclipped_sample():
 
 def test_demonstrations_hold_the_unclipped_sample():
     policy = make_trainer(log_std_init=1.0).policy
-    (trajectory,) = rl.roll_out("reacher", SETTINGS[0], policy, 1, seed=4)
+    (trajectory,) = rl.roll_out("reacher", SETTINGS[0], policy, 1, seed=4, purpose="test")
     assert np.abs(trajectory.actions).max() > 2.0
     world = envs.make("reacher", SETTINGS[0])
     observation, _ = world.reset(seed=trajectory.seed)
@@ -116,7 +117,7 @@ def test_a_resumed_robot_equals_an_uninterrupted_one_and_evaluation_leaves_it_al
     through = make_trainer(**NORMALISED, **sde)
     first = make_trainer(**NORMALISED, **sde)
     stored = train(first, [0])
-    rl.roll_out("reacher", SETTINGS[0], first.policy, 1, seed=0)
+    rl.roll_out("reacher", SETTINGS[0], first.policy, 1, seed=0, purpose="test")
     assert to_bytes(first.state_dict()) == stored
     resumed = make_trainer(**NORMALISED, **sde)
     resumed.load_state_dict(from_bytes(stored))

@@ -20,7 +20,8 @@ from irlcli.interventions import environment
 from irlcli.irl import airl
 from irlcli.irl.networks import RewardModel
 from irlcli.rl import Policy, Rollout, world_groups
-from irlcli.settings import AIRLSettings
+from irlcli.seeds import derive
+from irlcli.settings import PENALISED, AIRLSettings
 from irlcli.stages.outputs import write_json
 from irlcli.trajectories import Transitions, join, transitions
 
@@ -29,7 +30,8 @@ class Adversary:
     """Discriminator, its optimiser and the demonstrations.
 
     ERM pools every setting's transitions into one group (by count, as they come); ERM-balanced
-    and IRM keep one group per setting, each of equal weight.
+    and IRM keep one group per setting, each of equal weight. IRM-shuffled, the control, has as
+    many groups, but of episodes and worlds dealt out at random.
 
     Args:
         demos: demonstrations; their settings are the groups.
@@ -47,7 +49,21 @@ class Adversary:
         self.config = config
         self._horizon = environment(demos.env).max_episode_steps
         self._seed = seed
-        self._expert = [transitions(group, self._horizon) for group in demos.trajectories.values()]
+        groups = list(demos.trajectories.values())
+        self._world_settings = world_groups(len(worlds), len(groups))
+        self._world_groups = self._world_settings
+        self._expert_settings = [transitions(group, self._horizon) for group in groups]
+        self._expert = self._expert_settings
+        if config.method == "irm-shuffled":
+            rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
+            of_episodes = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+            episodes = [trajectory for group in groups for trajectory in group]
+            dealt = deal(of_episodes, rng)
+            self._expert = [
+                transitions([episodes[i] for i in np.flatnonzero(dealt == e)], self._horizon)
+                for e in range(len(groups))
+            ]
+            self._world_groups = deal(self._world_settings, rng)
         size = worlds.observation_space.shape[0]
         if self._expert[0].observations.shape[1] != size:
             raise IntegrityError(
@@ -64,7 +80,7 @@ class Adversary:
             activation=config.activation,
             gamma=config.ppo.gamma,
         )
-        torch.manual_seed(self._derived_seed(0))
+        torch.manual_seed(derive("discriminator", seed, -1)[0])
         self.model = RewardModel(**msgspec.to_builtins(self._network))
         self._optimizer = torch.optim.Adam(
             self.model.parameters(),
@@ -99,7 +115,7 @@ class Adversary:
             StageFailed: the discriminator's parameters stopped being finite.
         """
         config = self.config
-        data = self._by_setting(rollouts)
+        data = self._by_group(rollouts, self._world_groups)
         self.model.normaliser.update(
             torch.as_tensor(np.concatenate([d.observations for d in data]))
         )
@@ -108,7 +124,7 @@ class Adversary:
         past_pools = [self._pool(d, policy) for d in self._past]
         groups = self._grouped(policy_pools, expert_pools, past_pools)
         weight = 0.0
-        if config.method == "irm":
+        if config.method in PENALISED:
             weight = airl.penalty_weight_at(
                 index,
                 config.penalty_weight,
@@ -117,7 +133,7 @@ class Adversary:
             )
         # Every method sees as many samples per update.
         size = config.batch_size * len(expert_pools) // len(groups[0])
-        generator = torch.Generator().manual_seed(self._derived_seed(index + 1))
+        generator = torch.Generator().manual_seed(derive("discriminator", self._seed, index)[0])
         for _ in range(config.updates_per_round):
             batch = airl.sample_minibatch(
                 groups[0], groups[1], size, generator, groups[2], config.replay_share
@@ -134,20 +150,33 @@ class Adversary:
             )
         self._remember(data, index)
         self._scale = airl.reward_scale(self.model, [*policy_pools, *expert_pools])
-        # Per setting whatever the method pools, so that methods can be compared.
+        # Per setting whatever the method pools or shuffles, so that methods can be compared.
+        if config.method == "irm-shuffled":
+            true = self._by_group(rollouts, self._world_settings)
+            policy_pools = [self._pool(d, policy) for d in true]
+            expert_pools = [self._pool(d, policy) for d in self._expert_settings]
         with torch.no_grad():
             batch = airl.sample_minibatch(policy_pools, expert_pools, 1024, generator)
             return _diagnostics(self._losses(batch, weight), weight)
 
-    def _derived_seed(self, index: int) -> int:
-        return int(np.random.SeedSequence([self._seed, index, 1]).generate_state(1)[0])
+    def _by_group(self, rollouts: Sequence[Rollout], groups: np.ndarray) -> list[Transitions]:
+        """A round's transitions per group; ``groups`` [N] says to which each world belongs.
 
-    def _by_setting(self, rollouts: Sequence[Rollout]) -> list[Transitions]:
-        groups = world_groups(rollouts[0].terminated.shape[1], len(self._expert))
-        return [
-            join([rollout_transitions(r, groups == e, self._horizon) for r in rollouts])
-            for e in range(len(self._expert))
-        ]
+        Episodes that the round's end may have cut are left out whole. The rest are whole and
+        an unbiased sample of the policy's (Wald: which ones depends on when they start only).
+        """
+        ended = np.concatenate([r.terminated | r.truncated for r in rollouts])
+        whole = np.split(starts_by(ended, len(ended) - self._horizon), len(rollouts))
+        parts = []
+        for group in range(len(self._expert)):
+            worlds = groups == group
+            parts.append(
+                [
+                    rollout_transitions(r, worlds, self._horizon).take(kept[:, worlds].ravel())
+                    for r, kept in zip(rollouts, whole, strict=True)
+                ]
+            )
+        return [join(part) for part in parts]
 
     def _pool(self, data: Transitions, policy: Policy) -> airl.Pool:
         log_probs = policy.log_prob(
@@ -171,7 +200,7 @@ class Adversary:
 
     def _remember(self, data: Sequence[Transitions], index: int) -> None:
         """Keep a uniform sample of this round; thin the past where it outgrows its capacity."""
-        rng = np.random.default_rng(np.random.SeedSequence([self._seed, index, 2]))
+        rng = np.random.default_rng(derive("replay", self._seed, index)[0])
         config = self.config
         if config.replay_share == 0.0:
             return
@@ -223,6 +252,29 @@ class Adversary:
         description = descriptions.Reward(network=self._network, scale=self._scale, **origin)
         checkpoints.save(directory / "reward.pt", "reward", description, self.model.state_dict())
         write_json(directory / "reward.json", msgspec.to_builtins(description))
+
+
+def deal(settings: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Groups [N] instead of ``settings`` [N], as many, each with an equal share of every setting.
+
+    Which member of a setting goes to which group is random; no group stays empty.
+    """
+    groups = np.empty_like(settings)
+    count = settings.max() + 1
+    for setting in range(count):
+        members = rng.permutation(np.flatnonzero(settings == setting))
+        groups[members] = (setting + np.arange(len(members))) % count
+    return groups
+
+
+def starts_by(ended: np.ndarray, latest: int) -> np.ndarray:
+    """Steps [T, N] bool whose episode starts at step ``latest`` or before; the first always does.
+
+    ``ended`` [T, N] marks the last step of each episode; every world starts one at step 0.
+    """
+    starts = np.zeros(ended.shape, dtype=np.int64)
+    starts[1:] = np.where(ended[:-1], np.arange(1, len(ended))[:, None], 0)
+    return np.maximum.accumulate(starts) <= max(latest, 0)
 
 
 def rollout_transitions(rollout: Rollout, worlds: np.ndarray | slice, horizon: int) -> Transitions:

@@ -6,19 +6,18 @@ from typing import Literal
 import msgspec
 
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.interventions import Setting, check_tabular, environment, parse_setting
 from irlcli.settings import EvaluationSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
 Agent = Literal["policy", "random", "idle"]
-# Sets the seeds of evaluation apart from those of demonstrations.
-_EPISODES = 0xE7A1
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What an evaluation depends on, besides the policy."""
 
     env: str
+    physics: int
     settings: tuple[str, ...]
     agent: Agent
     seed: int
@@ -47,7 +46,14 @@ def request(
             "give a policy, or name the random or the idle agent",
         )
     texts = tuple(str(s) for s in settings_)
-    parameters = Parameters(env=env, settings=texts, agent=agent, seed=seed, evaluation=evaluation)
+    parameters = Parameters(
+        env=env,
+        physics=environment(env).physics,
+        settings=texts,
+        agent=agent,
+        seed=seed,
+        evaluation=evaluation,
+    )
     inputs = {} if policy is None else {"policy": policy}
     label = f"evaluate {agent} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, inputs, label)
@@ -71,14 +77,13 @@ def run(job: Job) -> None:
         del subject["network"]
     rows, summary = [], []
     for index, text in enumerate(p.settings):
-        # The same initial states in every setting, and none that demonstrations started from.
-        seed = int(np.random.SeedSequence([p.seed, _EPISODES]).generate_state(1)[0])
         trajectories = rl.roll_out(
             p.env,
             parse_setting(p.env, text),
             policy,
             p.evaluation.episodes,
-            seed,
+            p.seed,
+            STAGE.name,
             p.evaluation.deterministic,
         )
         warn_of_errors(job, text, trajectories)
@@ -114,4 +119,4 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", {"policy": subject, "settings": summary})
 
 
-STAGE = Stage("evaluate", 2, run)
+STAGE = Stage("evaluate", 3, run)

@@ -6,8 +6,8 @@ from contextlib import closing
 import msgspec
 
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.interventions import Setting, check_tabular, parse_setting
-from irlcli.settings import AIRLSettings
+from irlcli.interventions import Setting, check_tabular, environment, parse_setting
+from irlcli.settings import PENALISED, AIRLSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
 
@@ -15,6 +15,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a learned reward depends on, besides its demonstrations."""
 
     env: str
+    physics: int
     settings: tuple[str, ...]
     seed: int
     airl: AIRLSettings
@@ -48,7 +49,14 @@ def request(
             f"{airl.ppo.n_envs} worlds cannot be shared equally by {len(texts)} settings",
             f"--set airl.ppo.n_envs to a multiple of {len(texts)}",
         )
-    parameters = Parameters(env=env, settings=texts, seed=seed, airl=airl)
+    if airl.method not in PENALISED:
+        # What does not enter the loss is no part of the identity.
+        airl = msgspec.structs.replace(
+            airl, penalty_weight=0.0, penalty_warmup_rounds=0, penalty_ramp_rounds=0
+        )
+    parameters = Parameters(
+        env=env, physics=environment(env).physics, settings=texts, seed=seed, airl=airl
+    )
     label = f"train-airl {airl.method} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, {"demonstrations": demos}, label)
 
@@ -71,7 +79,7 @@ def run(job: Job) -> None:
         )
     parsed = [parse_setting(demos.env, s) for s in settings]
     with closing(rl.make_worlds(demos.env, parsed, p.airl.ppo.n_envs, job.workers)) as worlds:
-        trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed)
+        trainer = rl.PPOTrainer(worlds, p.airl.ppo, p.airl.total_steps, p.seed, STAGE.name)
         adversary = Adversary(demos, p.airl, worlds, p.seed)
         rows = train_rounds(job, trainer, settings, adversary=adversary)
     origin = {"settings": p.settings, "method": p.airl.method, "seed": p.seed}
@@ -80,4 +88,4 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("train-airl", 1, run)
+STAGE = Stage("train-airl", 2, run)

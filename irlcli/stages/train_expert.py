@@ -4,7 +4,7 @@ from contextlib import closing
 
 import msgspec
 
-from irlcli.interventions import Setting, check_tabular
+from irlcli.interventions import Setting, check_tabular, environment
 from irlcli.settings import ExpertSettings, PPOSettings
 from irlcli.stages import Job, Request, Stage
 
@@ -13,6 +13,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What an expert depends on."""
 
     env: str
+    physics: int
     setting: str
     seed: int
     total_steps: int
@@ -28,6 +29,7 @@ def request(env: str, setting: Setting, seed: int, expert: ExpertSettings) -> Re
     check_tabular(env, "train-expert", wanted=False)
     parameters = Parameters(
         env=env,
+        physics=environment(env).physics,
         setting=str(setting),
         seed=seed,
         total_steps=expert.total_steps,
@@ -46,7 +48,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     settings = [parse_setting(p.env, p.setting)]
     with closing(rl.make_worlds(p.env, settings, p.ppo.n_envs, job.workers)) as worlds:
-        trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed)
+        trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed, STAGE.name)
         rows = train_rounds(job, trainer, [p.setting])
     write_policy(
         job.output,
@@ -60,4 +62,4 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("train-expert", 1, run)
+STAGE = Stage("train-expert", 2, run)

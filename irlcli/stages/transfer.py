@@ -5,7 +5,7 @@ from contextlib import closing
 import msgspec
 
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.interventions import Setting, check_tabular, environment, parse_setting
 from irlcli.settings import TransferSettings
 from irlcli.stages import From, Job, Request, Source, Stage
 
@@ -14,6 +14,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a transferred policy depends on, besides the reward."""
 
     env: str
+    physics: int
     setting: str
     seed: int
     transfer: TransferSettings
@@ -30,7 +31,13 @@ def request(
         UsageError: a tabular environment.
     """
     check_tabular(env, "transfer", wanted=False)
-    parameters = Parameters(env=env, setting=str(setting), seed=seed, transfer=transfer)
+    parameters = Parameters(
+        env=env,
+        physics=environment(env).physics,
+        setting=str(setting),
+        seed=seed,
+        transfer=transfer,
+    )
     label = f"transfer {env} {setting} seed {seed}"
     return Request(STAGE, parameters, {"reward": reward}, label)
 
@@ -41,7 +48,6 @@ def run(job: Job) -> None:
 
     from irlcli import rl
     from irlcli.checkpoints import load_reward_file
-    from irlcli.interventions import environment
     from irlcli.irl import airl
     from irlcli.stages.adversary import rollout_transitions
     from irlcli.stages.outputs import write_metrics, write_policy
@@ -69,7 +75,7 @@ def run(job: Job) -> None:
                 "a goal (goal-y, direction) is part of the observation: transfer to a setting "
                 "with the same kind of intervention as in training",
             )
-        trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed)
+        trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed, STAGE.name)
         rows = train_rounds(job, trainer, [p.setting], reward)
     write_policy(
         job.output,
@@ -86,4 +92,4 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("transfer", 1, run)
+STAGE = Stage("transfer", 2, run)
