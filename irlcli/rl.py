@@ -2,8 +2,8 @@
 
 PPO is trained in *rounds*. A round seeds every generator from (seed, round), starts fresh
 episodes, collects one or more rollouts and updates on each. What leaves a round is only the
-network, its optimiser, running moments and a step count, so a run continued from any round's checkpoint equals
-an uninterrupted one byte for byte on the same machine.
+network, its optimiser, running moments and a step count, so a run continued from any round's
+checkpoint equals an uninterrupted one byte for byte on the same machine.
 """
 
 from __future__ import annotations
@@ -225,12 +225,12 @@ class PPOTrainer:
     @property
     def steps_per_round(self) -> int:
         """Environment steps of one round."""
-        return self.ppo.rollouts_per_round * self.ppo.n_steps * self._venv.num_envs
+        return _steps_per_round(self.ppo)
 
     @property
     def rounds(self) -> int:
         """Rounds that make up at least ``total_steps``."""
-        return -(-self.total_steps // self.steps_per_round)
+        return rounds(self.ppo, self.total_steps)
 
     @property
     def policy(self) -> Policy:
@@ -361,6 +361,15 @@ class PPOTrainer:
         self.model.num_timesteps = int(state["steps"])
         # Checkpoints from before rewards could be normalised have none.
         self._reward_moments = _moments(*state.get("reward_moments", (0.0, 1.0, 0.0)))
+
+
+def _steps_per_round(ppo: PPOSettings) -> int:
+    return ppo.rollouts_per_round * ppo.n_steps * ppo.n_envs
+
+
+def rounds(ppo: PPOSettings, total_steps: int) -> int:
+    """Rounds that make up at least ``total_steps``."""
+    return -(-total_steps // _steps_per_round(ppo))
 
 
 class Policy:
