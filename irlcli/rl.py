@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from msgspec import UNSET
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -276,6 +277,9 @@ class PPOTrainer:
                 # SB3 schedules the learning rate and the clip range only.
                 self.model.ent_coef = self.ppo.ent_coef * remaining
             self.model.train()
+            if self.ppo.log_std_max is not UNSET:
+                with torch.no_grad():
+                    self.model.policy.log_std.clamp_(max=self.ppo.log_std_max)
             if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
                 raise StageFailed(
                     f"the policy's parameters are not finite after an update in round {index}",

@@ -63,6 +63,7 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     # For continuous actions. Unset is off (or SB3's default) and not part of an artefact's key:
     # what was made before these settings existed is still found.
     log_std_init: Finite | UnsetType = UNSET
+    log_std_max: Finite | UnsetType = UNSET
     normalise_observations: bool | UnsetType = UNSET
     normalise_rewards: bool | UnsetType = UNSET
     use_sde: bool | UnsetType = UNSET
