@@ -178,7 +178,7 @@ class PPOTrainer:
         purpose: the stage; stages of one seed share neither initial weights nor worlds.
 
     Raises:
-        UsageError: gSDE, where actions are discrete.
+        UsageError: gSDE or a standard deviation, where actions are discrete.
     """
 
     def __init__(self, worlds: Worlds, ppo: PPOSettings, total_steps: int, seed: int, purpose: str):
@@ -187,8 +187,13 @@ class PPOTrainer:
         self.total_steps = total_steps
         self._seed = seed
         self._purpose = purpose
-        if ppo.use_sde and isinstance(worlds.action_space, gymnasium.spaces.Discrete):
-            raise UsageError("gSDE needs continuous actions", "leave ppo.use_sde unset")
+        if isinstance(worlds.action_space, gymnasium.spaces.Discrete):
+            for name in ("use_sde", "log_std_init", "log_std_max"):
+                value = getattr(ppo, name)
+                if value is not UNSET and value is not False:
+                    raise UsageError(
+                        f"ppo.{name} needs continuous actions", f"leave ppo.{name} unset"
+                    )
         self._venv = _RecordingVecEnv(worlds)
         self._reward_moments = _moments(0.0, 1.0, 0.0)
         self._discounted = np.zeros(len(worlds))

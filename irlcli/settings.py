@@ -61,7 +61,8 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     activation: Activation = "tanh"
     ortho_init: bool = True
     # For continuous actions. Unset is off (or SB3's default) and not part of an artefact's key:
-    # what was made before these settings existed is still found.
+    # what was made before these settings existed is still found. Where actions beyond the bounds
+    # are clipped, ``log_std_max`` bounds an entropy that would cost the policy nothing.
     log_std_init: Finite | UnsetType = UNSET
     log_std_max: Finite | UnsetType = UNSET
     normalise_observations: bool | UnsetType = UNSET
