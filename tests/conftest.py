@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -18,6 +19,9 @@ import pytest
 
 from irlcli import cli as command_line
 from irlcli.store import KeyRecord, Published, Store
+
+# A shell that starts the tests in the background makes them, and their children, deaf to it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from conftest import run_main
 
 from irlcli import rl
 from irlcli.dataset import Demonstrations
@@ -108,7 +107,7 @@ def test_a_single_demonstration_cannot_be_held_out(demos):
 
 
 @pytest.fixture(scope="module")
-def chosen(smoke_store, tmp_path_factory):
+def chosen(smoke_store, tmp_path_factory, run_irl):
     """A reward whose lambda was chosen, and its store."""
     import shutil
 
@@ -116,11 +115,11 @@ def chosen(smoke_store, tmp_path_factory):
     shutil.copytree(smoke_store.path, path)
     arguments = ["train-airl", "--demos", "demos", "--method", "irm", "--profile", "smoke"]
     arguments += ["--store", str(path), "--choose-penalty", "1,0.1", "--name", "chosen"]
-    plan = run_main([*arguments, "--dry-run"]).out
+    plan = run_irl([*arguments, "--dry-run"]).out
     assert plan.count("RUN ") == 4 and plan.count("BLOCKED") == 2
-    done = run_main(arguments)
+    done = run_irl(arguments)
     assert done.code == 0, done.err
-    assert run_main([*arguments, "--dry-run"]).out.startswith("HIT")
+    assert run_irl([*arguments, "--dry-run"]).out.startswith("HIT")
     return Store(path)
 
 
@@ -149,10 +148,10 @@ def test_lambda_is_the_one_that_does_best_in_the_settings_left_out(chosen):
             assert learned["selected"]["score"] == row[setting]
 
 
-def test_the_selected_round_is_on_record(chosen):
+def test_the_selected_round_is_on_record(chosen, run_irl):
     arguments = ["train-airl", "--demos", "demos", "--profile", "smoke", "--json"]
     arguments += ["--store", str(chosen.root), "--select", "episodes"]
-    done = run_main([*arguments, "--set", "airl.select_every=1"])
+    done = run_irl([*arguments, "--set", "airl.select_every=1"])
     assert done.code == 0, done.err
     artefact = chosen.resolve(json.loads(done.out)["id"]).artefact
     selected = read_json(chosen.open(artefact, "reward.json"))["selected"]
@@ -161,8 +160,8 @@ def test_the_selected_round_is_on_record(chosen):
     rows = pq.read_table(chosen.open(artefact, "metrics.parquet")).to_pylist()
     scores = {row["round"]: row["score"] for row in rows}
     assert selected["score"] == max(scores.values()) == scores[selected["round"]]
-    last = run_main([*arguments[:-1], "last", "--dry-run"]).out
-    plain = run_main([*arguments[:-2], "--dry-run"]).out
+    last = run_irl([*arguments[:-1], "last", "--dry-run"]).out
+    plain = run_irl([*arguments[:-2], "--dry-run"]).out
     assert last == plain
 
 
@@ -180,9 +179,9 @@ def test_the_selected_round_is_on_record(chosen):
         (["--choose-penalty", "1,2", "--method", "erm"], "'erm'", "irm-shuffled"),
     ],
 )
-def test_bad_input(smoke_store, arguments, named, hint):
+def test_bad_input(smoke_store, run_irl, arguments, named, hint):
     common = ["train-airl", "--demos", "demos", "--method", "irm", "--profile", "smoke"]
-    done = run_main([*common, "--store", str(smoke_store.path), *arguments])
+    done = run_irl([*common, "--store", str(smoke_store.path), *arguments])
     assert done.code == 2
     assert done.out == ""
     message, hinted = done.err.strip().splitlines()[-2:]
