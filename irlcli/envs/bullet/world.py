@@ -26,7 +26,6 @@ TIME_STEP = 0.0165
 SUBSTEPS = 4
 GRAVITY = 9.8
 GOAL_DISTANCE = 1000.0
-NOT_FINITE = "the state of the world is not finite"
 
 _SELF_COLLISION = (
     pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
@@ -182,41 +181,10 @@ class Goal:
         angle = math.radians(low if low == high else random.uniform(low, high))
         return GOAL_DISTANCE * math.cos(angle), GOAL_DISTANCE * math.sin(angle)
 
-
-def is_finite(array: np.ndarray) -> bool:
-    """Whether every number of a vector is finite (and far below overflow)."""
-    # One product of the vector with itself is much cheaper than ``np.isfinite(...).all()``.
-    return math.isfinite(array.dot(array))
-
-
-def clipped(action: np.ndarray, size: int) -> np.ndarray:
-    """``action`` [size] as float64, clipped to the actuators' range [-1, 1].
-
-    Raises:
-        ValueError: another shape, or a number that is not finite.
-    """
-    action = np.asarray(action, dtype=np.float64)
-    if action.shape != (size,):
-        raise ValueError(f"action must have shape ({size},), not {action.shape}")
-    if not is_finite(action):
-        raise ValueError(f"action must be finite, not {action.tolist()}")
-    return np.minimum(np.maximum(action, -1.0), 1.0)
-
-
-def start_positions(options: dict | None, size: int) -> np.ndarray | None:
-    """``options["joint_positions"]`` [size] of a reset, or ``None`` where not given.
-
-    Raises:
-        ValueError: another option, another shape, or a number that is not finite.
-    """
-    if not options:
-        return None
-    if set(options) != {"joint_positions"}:
-        raise ValueError(f"the only reset option is 'joint_positions', not {sorted(options)}")
-    positions = np.asarray(options["joint_positions"], dtype=np.float64)
-    if positions.shape != (size,) or not np.isfinite(positions).all():
-        raise ValueError(f"joint_positions must be {size} finite numbers, not {positions.tolist()}")
-    return positions
+    def observation(self, goal: tuple[float, float]) -> list[float]:
+        """The unit vector to ``goal``, or nothing where the goal is not observed."""
+        norm = math.hypot(*goal)
+        return [goal[0] / norm, goal[1] / norm] if self.observed else []
 
 
 def _has_display() -> bool:
@@ -320,7 +288,7 @@ class World:
 
     def step(self) -> None:
         """Advance one time step."""
-        pybullet.stepSimulation(physicsClientId=self.client)
+        pybullet.stepSimulation(self.client)
 
     def look_at(self, target: Vector, distance: float) -> None:
         """Point the window's camera."""
@@ -452,7 +420,7 @@ class Robot:
 
     def states(self) -> tuple[list[float], list[float]]:
         """Positions and velocities of the joints read."""
-        states = pybullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
+        states = pybullet.getJointStates(self.body, self.joints, self.client)
         return [state[0] for state in states], [state[1] for state in states]
 
     def drive(self, torques: np.ndarray) -> None:
