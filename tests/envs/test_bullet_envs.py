@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -165,6 +167,41 @@ def test_a_world_that_explodes_ends_its_episode_and_the_next_one_is_sound(env):
     assert (reward, terminated, truncated) == (0.0, False, True)
     np.testing.assert_array_equal(observation, before)
     np.testing.assert_array_equal(roll(env, 5), expected)
+
+
+def test_a_half_cheetah_that_is_nowhere_ends_its_episode():
+    """How far forward it is decides the reward, but is no part of the observation."""
+    env = ROBOTS["half_cheetah"]()
+    env.reset(seed=0)
+    robot, client = body(env)
+    pybullet.resetJointState(robot, 0, math.inf, 0.0, physicsClientId=client)
+    *_, truncated, info = env.step(np.zeros(6))
+    env.close()
+    assert truncated
+    assert info == {"error": "the state of the world is not finite"}
+
+
+QUIET = """
+import os, sys
+sys.path.insert(0, {fake!r})
+import irlcli.envs.bullet
+print(sys.modules["pybullet"].__file__)
+"""
+
+
+def test_what_pybullet_says_when_imported_is_passed_on_but_for_its_banner(tmp_path):
+    (tmp_path / "pybullet.py").write_text(
+        "import os\nos.write(2, b'pybullet build time: today\\nreal trouble\\n')\n"
+    )
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", QUIET.format(fake=fake)], capture_output=True, text=True
+        )
+        for fake in (str(tmp_path), "")
+    ]
+    assert said[0].stdout == f"{tmp_path / 'pybullet.py'}\n"
+    assert said[0].stderr == "real trouble\n"
+    assert (said[1].returncode, said[1].stderr) == (0, "")
 
 
 def test_training_goes_on_after_an_explosion():

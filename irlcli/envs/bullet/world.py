@@ -233,7 +233,7 @@ class World:
 
     Args:
         render_mode: ``None``, ``"rgb_array"`` (software renderer) or ``"human"`` (a window).
-        gravity: downward, m/s^2.
+        gravity: acceleration, m/s^2.
         substeps: solver steps per time step.
         ground: whether there is a floor (friction 0.8, restitution 0.5).
 
@@ -245,7 +245,7 @@ class World:
     def __init__(
         self,
         render_mode: str | None,
-        gravity: float = GRAVITY,
+        gravity: Vector = (0.0, 0.0, -GRAVITY),
         substeps: int = SUBSTEPS,
         ground: bool = True,
     ):
@@ -271,7 +271,7 @@ class World:
         """
         client = self.client
         pybullet.resetSimulation(physicsClientId=client)
-        pybullet.setGravity(0.0, 0.0, -self._gravity, physicsClientId=client)
+        pybullet.setGravity(*self._gravity, physicsClientId=client)
         pybullet.setDefaultContactERP(0.9, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
