@@ -7,12 +7,14 @@ import subprocess
 import sys
 import warnings
 
+import gymnasium
 import numpy as np
 import pybullet
 import pytest
 from bullet_robots import ROBOTS, body
 from gymnasium.utils.env_checker import check_env
 
+import irlcli.envs  # noqa: F401 (registers the environments)
 from irlcli.envs.bullet.ant import Ant
 from irlcli.envs.vector import VectorWorlds
 
@@ -33,6 +35,16 @@ def test_passes_gymnasiums_check(name, model):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("name", ["Ant", "HalfCheetah", "Reacher"])
+def test_passes_gymnasiums_check_of_rendering_without_a_display(name, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    env = gymnasium.make(f"irlcli/{name}-v0", render_mode="rgb_array").unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env)
     env.close()
 
 

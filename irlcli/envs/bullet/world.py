@@ -187,7 +187,7 @@ class Goal:
         return [goal[0] / norm, goal[1] / norm] if self.observed else []
 
 
-def _has_display() -> bool:
+def has_display() -> bool:
     """Whether an X server answers; Bullet's window ends the whole process where none does."""
     if not os.environ.get("DISPLAY"):
         return False
@@ -253,7 +253,7 @@ class World:
             raise ValueError(
                 f"render_mode must be None, 'rgb_array' or 'human', not {render_mode!r}"
             )
-        if render_mode == "human" and not _has_display():
+        if render_mode == "human" and not has_display():
             raise RuntimeError(
                 "render_mode='human' needs a display and none answers; use 'rgb_array'"
             )
