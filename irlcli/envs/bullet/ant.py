@@ -150,7 +150,7 @@ class Ant(RobotEnv):
 
     start_range = (0.1,) * 8
     torques = np.full(8, 250.0)
-    camera_distance = 3.0
+    camera = 5.0, -50.0
 
     def __init__(
         self,

@@ -35,8 +35,8 @@ class RobotEnv(gymnasium.Env, abc.ABC):
     start_range: ClassVar[Sequence[float]]
     #: Torques [A] of an action of ones.
     torques: ClassVar[np.ndarray]
-    #: From the camera to what it looks at.
-    camera_distance: ClassVar[float]
+    #: Distance of the camera from what it looks at, and its pitch in degrees.
+    camera: ClassVar[tuple[float, float]]
 
     def __init__(self, world: World, observations: int, render_mode: str | None):
         self._world = world
@@ -98,14 +98,14 @@ class RobotEnv(gymnasium.Env, abc.ABC):
         self._observation = observation
         self._potential = potential
         if self.render_mode == "human":
-            self._world.look_at(self._focus(), self.camera_distance)
+            self._world.look_at(self._focus(), self.camera)
         return observation, reward, False, False, info
 
     def render(self) -> np.ndarray | None:
         """A picture of the robot [240, 320, 3] uint8; ``None`` unless ``"rgb_array"``."""
         if self.render_mode != "rgb_array":
             return None
-        return self._world.image(self._focus(), self.camera_distance)
+        return self._world.image(self._focus(), self.camera)
 
     def close(self) -> None:
         """Disconnect from Bullet."""

@@ -183,7 +183,7 @@ class HalfCheetah(RobotEnv):
 
     start_range = (0.1,) * 9
     torques = np.array([120.0, 90.0, 60.0, 140.0, 60.0, 30.0])
-    camera_distance = 3.0
+    camera = 3.0, -15.0
 
     def __init__(
         self,

@@ -96,7 +96,7 @@ class Reacher(RobotEnv):
 
     start_range = (3.14, 3.14, 0.27, 0.27)
     torques = np.full(2, 0.05)
-    camera_distance = 0.6
+    camera = 0.55, -65.0
 
     def __init__(
         self,

@@ -290,15 +290,20 @@ class World:
         """Advance one time step."""
         pybullet.stepSimulation(self.client)
 
-    def look_at(self, target: Vector, distance: float) -> None:
-        """Point the window's camera."""
+    def look_at(self, target: Vector, camera: tuple[float, float]) -> None:
+        """Point the window's camera as :meth:`image` does."""
+        distance, pitch = camera
         pybullet.resetDebugVisualizerCamera(
-            distance, 0.0, -30.0, target, physicsClientId=self.client
+            distance, 0.0, pitch, target, physicsClientId=self.client
         )
 
-    def image(self, target: Vector, distance: float) -> np.ndarray:
-        """A picture from behind and above ``target``: [240, 320, 3] uint8."""
-        view = pybullet.computeViewMatrixFromYawPitchRoll(target, distance, 0.0, -30.0, 0.0, 2)
+    def image(self, target: Vector, camera: tuple[float, float]) -> np.ndarray:
+        """A picture of ``target``, which moves to the right: [240, 320, 3] uint8.
+
+        ``camera`` is the distance and the pitch in degrees (negative looks down).
+        """
+        distance, pitch = camera
+        view = pybullet.computeViewMatrixFromYawPitchRoll(target, distance, 0.0, pitch, 0.0, 2)
         projection = pybullet.computeProjectionMatrixFOV(60.0, 320 / 240, 0.01, 100.0)
         _, _, pixels, _, _ = pybullet.getCameraImage(
             320,
