@@ -38,6 +38,7 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.parallel
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
+	$(VENV)/bin/python -m benchmarks.workers
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
 	else echo "benchmarks.bullet_step was left out: it counts instructions with valgrind"; fi
 

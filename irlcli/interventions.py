@@ -140,6 +140,7 @@ ENVIRONMENTS: dict[str, Environment] = {
         gym_id="irlcli/Reacher-v0",
         max_episode_steps=150,
         knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "1x", "of 9.8 m/s^2")},
+        physics=2,
     ),
     "gridworld": Environment(
         name="gridworld",

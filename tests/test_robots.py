@@ -285,8 +285,7 @@ def test_play_draws_the_settings_side_by_side(chains, irl, tmp_path):
         picture = np.array(gif.convert("RGB")).astype(int)
     left, middle = picture[16:, :320], picture[16:, 320:640]
     assert left.std() > 1.0
-    # Gravity turns no joint of the Reacher: the same picture, whatever the caption says.
-    np.testing.assert_array_equal(left, middle)
+    assert (left != middle).any()
     assert (picture[:16, :320] != picture[:16, 320:640]).any()
 
 

@@ -3,19 +3,23 @@
 Every worker steps its own share of the worlds as :class:`irlcli.envs.vector.VectorWorlds`
 does; observations, actions and rewards cross in shared memory, only the episodes that ended
 cross in messages. A world never sees another, so results do not depend on the number of
-workers.
+workers. The worlds are dealt out like cards: those of one setting, which cost the same, stand
+side by side.
+
+A message is one byte, which is all that most steps need ("step"; "done, no episode ended"), or
+the byte that says so and a pickle.
 """
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -23,10 +27,35 @@ import numpy as np
 from irlcli.envs.vector import Ended, VectorWorlds
 
 _CLOSE_SECONDS = 5.0
+# What a pipe raises whose other end is gone.
+_CLOSED = (EOFError, BrokenPipeError, ConnectionResetError)
+_PLAIN, _PICKLED = b"0", b"1"
 
 
 class WorkerFailed(RuntimeError):
     """A worker process died, or an environment in it raised an error."""
+
+
+class _Channel(NamedTuple):
+    """One end of a pair of pipes. ``None`` is the message that costs nothing."""
+
+    incoming: Connection
+    outgoing: Connection
+
+    def send(self, message: Any) -> None:
+        os.write(self.outgoing.fileno(), _PLAIN if message is None else _PICKLED)
+        if message is not None:
+            self.outgoing.send(message)
+
+    def receive(self) -> Any:
+        byte = os.read(self.incoming.fileno(), 1)
+        if not byte:
+            raise EOFError
+        return self.incoming.recv() if byte == _PICKLED else None
+
+    def close(self) -> None:
+        self.incoming.close()
+        self.outgoing.close()
 
 
 @dataclass(frozen=True)
@@ -51,10 +80,11 @@ class _Shared:
 
 
 def _work(
-    connection: Connection,
+    channel: _Channel,
     factories: Sequence[Callable[[], gymnasium.Env]],
     max_episode_steps: int,
-    first: int,
+    worker: int,
+    workers: int,
     shared: _Shared,
 ) -> None:
     """A worker's life: serve requests until told to stop or until the parent is gone.
@@ -65,23 +95,22 @@ def _work(
     # Ctrl-C reaches the whole foreground group; what it means is the parent's decision.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     worlds: VectorWorlds | None = None
-    last = first + len(factories)
-    actions, observations, rewards = (view[first:last] for view in shared.views())
+    actions, observations, rewards = (view[worker::workers] for view in shared.views())
     try:
         worlds = VectorWorlds([factory() for factory in factories], max_episode_steps)
         while True:
-            seeds = connection.recv()
+            seeds = channel.receive()
+            ended: list[Ended] = []
             if seeds is None:
-                ended: list[Ended] = []
                 observations[:], rewards[:], ended = worlds.step(actions)
-                connection.send([replace(end, world=first + end.world) for end in ended])
             else:
                 observations[:] = worlds.reset(seeds)
-                connection.send([])
-    except (EOFError, BrokenPipeError, ConnectionResetError):
+            ended = [replace(end, world=worker + workers * end.world) for end in ended]
+            channel.send(ended or None)
+    except _CLOSED:
         pass
     except Exception as error:
-        connection.send(f"{type(error).__name__}: {error}")
+        channel.send(f"{type(error).__name__}: {error}")
     finally:
         if worlds is not None:
             worlds.close()
@@ -127,22 +156,22 @@ class WorkerWorlds:
             isinstance(self.action_space, gymnasium.spaces.Discrete),
         )
         self._actions, self._observations, self._rewards = shared.views()
-        bounds = [self._size * worker // workers for worker in range(workers + 1)]
-        self._shares = list(itertools.pairwise(bounds))
         # A spawned process inherits no pipe end of its siblings, which would hide a death.
         context = multiprocessing.get_context("spawn")
-        self._connections: list[Connection] = []
+        self._channels: list[_Channel] = []
         self._processes: list[multiprocessing.process.BaseProcess] = []
-        for first, last in self._shares:
-            ours, theirs = context.Pipe()
+        for worker in range(workers):
+            (requests, ask), (answers, answer) = context.Pipe(False), context.Pipe(False)
+            theirs = _Channel(requests, answer)
+            share = factories[worker::workers]
             process = context.Process(
                 target=_work,
-                args=(theirs, factories[first:last], max_episode_steps, first, shared),
+                args=(theirs, share, max_episode_steps, worker, workers, shared),
                 daemon=True,
             )
             process.start()
             theirs.close()
-            self._connections.append(ours)
+            self._channels.append(_Channel(answers, ask))
             self._processes.append(process)
 
     def __len__(self) -> int:
@@ -157,7 +186,9 @@ class WorkerWorlds:
         """
         if len(seeds) != self._size:
             raise ValueError(f"{self._size} seeds are needed, not {len(seeds)}")
-        self._ask([[int(seed) for seed in seeds[first:last]] for first, last in self._shares])
+        workers = len(self._channels)
+        shares = [[int(seed) for seed in seeds[worker::workers]] for worker in range(workers)]
+        self._ask(shares)
         return self._observations.copy()
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Ended]]:
@@ -176,50 +207,49 @@ class WorkerWorlds:
         if not np.isfinite(actions).all():
             raise ValueError("actions must be finite")
         self._actions[:] = actions
-        ended = self._ask([None] * len(self._shares))
+        ended = self._ask([None] * len(self._channels))
         return self._observations.copy(), self._rewards.copy(), ended
 
     def close(self) -> None:
         """End every worker; closing twice does nothing."""
-        for connection in self._connections:
-            connection.close()
+        for channel in self._channels:
+            channel.close()
         for process in self._processes:
             process.join(_CLOSE_SECONDS)
             if process.is_alive():
                 process.kill()
                 process.join()
-        self._connections = []
+        self._channels = []
         self._processes = []
 
     def _ask(self, requests: Sequence[list[int] | None]) -> list[Ended]:
-        """Send one request to each worker and gather the episodes that ended."""
-        if not self._connections:
+        """Send one request to each worker and gather the episodes that ended, by world."""
+        if not self._channels:
             raise WorkerFailed("the workers are closed")
         ended: list[Ended] = []
+        worker = 0
         try:
             for worker, request in enumerate(requests):
-                self._exchange(worker, lambda connection, r=request: connection.send(r))
-            for worker in range(len(requests)):
-                answer = self._exchange(worker, lambda connection: connection.recv())
+                self._channels[worker].send(request)
+            for worker, channel in enumerate(self._channels):
+                answer = channel.receive()
                 if isinstance(answer, str):
-                    raise WorkerFailed(f"worker {worker} ({self._worlds(worker)}): {answer}")
-                ended.extend(answer)
-        except BaseException:
+                    raise WorkerFailed(f"{self._name(worker)}: {answer}")
+                ended += answer or []
+        except BaseException as error:
             # An answer left unread would be taken for that of the next request.
+            failure = self._died(worker) if isinstance(error, _CLOSED) else error
             self.close()
-            raise
-        return ended
+            raise failure from None
+        return sorted(ended, key=lambda end: end.world)
 
-    def _exchange(self, worker: int, exchange: Callable[[Connection], Any]) -> Any:
-        try:
-            return exchange(self._connections[worker])
-        except (EOFError, BrokenPipeError, ConnectionResetError):
-            process = self._processes[worker]
-            process.join(_CLOSE_SECONDS)
-            code = process.exitcode
-            cause = f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
-            raise WorkerFailed(f"worker {worker} ({self._worlds(worker)}) died: {cause}") from None
+    def _died(self, worker: int) -> WorkerFailed:
+        process = self._processes[worker]
+        process.join(_CLOSE_SECONDS)
+        code = process.exitcode
+        cause = f"signal {-code}" if code is not None and code < 0 else f"exit status {code}"
+        return WorkerFailed(f"{self._name(worker)} died: {cause}")
 
-    def _worlds(self, worker: int) -> str:
-        first, last = self._shares[worker]
-        return f"world {first}" if last == first + 1 else f"worlds {first} to {last - 1}"
+    def _name(self, worker: int) -> str:
+        worlds = list(range(worker, self._size, len(self._channels)))
+        return f"worker {worker} ({'world' if len(worlds) == 1 else 'worlds'} {str(worlds)[1:-1]})"

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import warnings
 
+import gymnasium
 import numpy as np
 import pybullet
 import pytest
 from bullet_robots import ROBOTS, body
 from gymnasium.utils.env_checker import check_env
 
+import irlcli.envs  # noqa: F401 (registers the environments)
 from irlcli.envs.bullet.ant import Ant
 from irlcli.envs.vector import VectorWorlds
 
@@ -31,6 +35,16 @@ def test_passes_gymnasiums_check(name, model):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("name", ["Ant", "HalfCheetah", "Reacher"])
+def test_passes_gymnasiums_check_of_rendering_without_a_display(name, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    env = gymnasium.make(f"irlcli/{name}-v0", render_mode="rgb_array").unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env)
     env.close()
 
 
@@ -165,6 +179,29 @@ def test_a_world_that_explodes_ends_its_episode_and_the_next_one_is_sound(env):
     assert (reward, terminated, truncated) == (0.0, False, True)
     np.testing.assert_array_equal(observation, before)
     np.testing.assert_array_equal(roll(env, 5), expected)
+
+
+QUIET = """
+import os, sys
+sys.path.insert(0, {fake!r})
+import irlcli.envs.bullet
+print(sys.modules["pybullet"].__file__)
+"""
+
+
+def test_what_pybullet_says_when_imported_is_passed_on_but_for_its_banner(tmp_path):
+    (tmp_path / "pybullet.py").write_text(
+        "import os\nos.write(2, b'pybullet build time: today\\nreal trouble\\n')\n"
+    )
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", QUIET.format(fake=fake)], capture_output=True, text=True
+        )
+        for fake in (str(tmp_path), "")
+    ]
+    assert said[0].stdout == f"{tmp_path / 'pybullet.py'}\n"
+    assert said[0].stderr == "real trouble\n"
+    assert (said[1].returncode, said[1].stderr) == (0, "")
 
 
 def test_training_goes_on_after_an_explosion():

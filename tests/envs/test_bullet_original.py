@@ -11,7 +11,8 @@ from irlcli.envs.bullet.world import TIME_STEP
 
 # Bullet's MJCF importer leaves memory uninitialised that decides in which order contacts are
 # solved. This recording was made with other memory contents than zeros: its order differs from
-# step 23 on, and contact amplifies that.
+# step 23 on, and contact amplifies that. Filling the memory with any other byte, or making the
+# links' boxes anew in some 7,000 orders, gave at most 295 of its 400 steps.
 SAME_ORDER = {"half_cheetah_0": 23}
 
 
@@ -41,6 +42,24 @@ def test_original_reproduces_the_recorded_trace(name):
     np.testing.assert_allclose(
         rewards[first : last - 1], recorded["rewards"][first : last - 1], 1e-6, 1e-6
     )
+
+
+def test_the_odd_trace_is_a_matter_of_the_order_of_contacts():
+    recorded = trace("half_cheetah_0")
+    env = ROBOTS["half_cheetah"](model="original")
+    start = recorded["initial_joint_positions"]
+    agreed = 0
+    for _ in range(3):
+        path = [env.reset(seed=0, options={"joint_positions": start})[0]]
+        robot, client = body(env)
+        for link in (13, 11, 9, 3, 7, 5):
+            # Setting a filter, even to what it was, enters the link's box into the tree anew.
+            pybullet.setCollisionFilterGroupMask(robot, link, 1, 1, physicsClientId=client)
+        path += [env.step(action)[0] for action in recorded["actions"]]
+        equal = np.isclose(path, recorded["observations"], rtol=1e-6, atol=1e-6).all(axis=1)
+        agreed = max(agreed, len(equal) if equal.all() else int(np.argmin(equal)))
+    env.close()
+    assert agreed > 250
 
 
 def test_the_ants_first_reward_differs_by_the_floor():

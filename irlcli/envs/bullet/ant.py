@@ -9,37 +9,32 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
 
-import gymnasium
 import numpy as np
 import pybullet
 
+from irlcli.envs.bullet.episode import RobotEnv
 from irlcli.envs.bullet.world import (
     FROM_TO_MARGIN,
-    NOT_FINITE,
     SUBSTEPS,
     TIME_STEP,
     Capsule,
     Goal,
     Link,
     Robot,
+    Vector,
     World,
     box_inertia,
-    clipped,
-    is_finite,
     moving_joints,
     require,
     require_friction,
     require_model,
     single,
-    start_positions,
 )
 
 _RADIUS = single(0.08)
 _FIXED = _UPPER = single(0.2)
 _LOWER = single(0.4)
-_TORQUE = 250.0
 _START_HEIGHT = 0.75
 # The importer's single-precision radians of 40, 30 and 100 degrees.
 _HIP = 0.6981317400932312
@@ -125,7 +120,7 @@ def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
     return Link(mass, (moments[0], moments[1], moments[2]), tuple(shapes)), links
 
 
-class Ant(gymnasium.Env):
+class Ant(RobotEnv):
     """A four-legged walker, pulled toward a goal 1 km away.
 
     Observation [27] float32: height and orientation quaternion (x, y, z, w) of the torso, 8
@@ -153,10 +148,9 @@ class Ant(gymnasium.Env):
         RuntimeError: ``"human"`` without a display.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": round(1.0 / TIME_STEP),
-    }
+    start_range = (0.1,) * 8
+    torques = np.full(8, 250.0)
+    camera = 5.0, -50.0
 
     def __init__(
         self,
@@ -174,11 +168,7 @@ class Ant(gymnasium.Env):
         self.leg_length = require("leg_length", leg_length, 0.2, 5.0)
         self.model = require_model(model, self.leg_length)
         self.goal = Goal(goal_y, direction)
-        self.render_mode = render_mode
         self._zeros = [0.0] * 84 if full_observation else []
-        size = 27 + len(self._zeros) + 2 * self.goal.observed
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (8,), np.float32)
         # What each leg adds to the sum of the links' positions, hips aside: 2.5 upper segments
         # (its middle once, its end twice) and half a lower one. A leg's direction in the
         # torso's plane is a complex number.
@@ -188,68 +178,12 @@ class Ant(gymnasium.Env):
             direction = scale * complex(x, y)
             drop = -0.5 * math.sqrt(2.0) * _LOWER * scale * sign
             self._legs.append((2.5 * _UPPER * direction, 0.5 * _LOWER * direction, drop))
-        self._world = World(render_mode)
+        size = 27 + len(self._zeros) + 2 * self.goal.observed
+        super().__init__(World(render_mode), size, render_mode)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; ``options["joint_positions"]`` [8] replaces the drawn start.
-
-        Raises:
-            ValueError: another option, another shape, or a number that is not finite.
-        """
-        super().reset(seed=seed)
-        positions = start_positions(options, 8)
-        if positions is None:
-            positions = self.np_random.uniform(-0.1, 0.1, 8)
+    def _place(self, positions: np.ndarray) -> Robot:
         self._goal = self.goal.draw(self.np_random)
-        norm = math.hypot(*self._goal)
-        self._tail = self._zeros + (
-            [self._goal[0] / norm, self._goal[1] / norm] if self.goal.observed else []
-        )
-        self._world.clear()
-        self._robot = self._place()
-        self._robot.set_friction(self.friction)
-        if self.mass != 1.0:
-            self._robot.scale_mass(self.mass)
-        if self.render_mode is not None:
-            self._robot.paint((0.8, 0.5, 0.3, 1.0))
-        self._robot.place(positions)
-        self._observation, _, self._potential = self._observe()
-        return self._observation, {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance 0.0165 s.
-
-        Raises:
-            ValueError: an action of another shape, or not finite.
-        """
-        self._robot.drive(_TORQUE * clipped(action, 8))
-        self._world.step()
-        observation, angles, potential = self._observe()
-        if not is_finite(observation):
-            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
-        at_limit = -0.1 * _joints_at_limit(angles)
-        progress = potential - self._potential
-        self._observation = observation
-        self._potential = potential
-        if self.render_mode == "human":
-            self._world.look_at(self._position, 3.0)
-        info = {"alive": 1.0, "progress": progress, "joints_at_limit": at_limit}
-        return observation, 1.0 + progress + at_limit, False, False, info
-
-    def render(self) -> np.ndarray | None:
-        """A picture of the Ant [240, 320, 3] uint8; ``None`` unless ``"rgb_array"``."""
-        if self.render_mode != "rgb_array":
-            return None
-        return self._world.image(self._position, 3.0)
-
-    def close(self) -> None:
-        """Disconnect from Bullet."""
-        self._world.close()
-
-    def _place(self) -> Robot:
-        """The robot at its start."""
+        self._tail = self._zeros + self.goal.observation(self._goal)
         client = self._world.client
         if self.model == "original":
             (body,) = self._world.load("ant.xml", pybullet.MJCF_COLORS_FROM_FILE)
@@ -257,16 +191,31 @@ class Ant(gymnasium.Env):
         else:
             body = self._world.build(*morphology(self.leg_length), (0.0, 0.0, _START_HEIGHT))
             joints = list(range(8))
-        return Robot(client, body, joints, joints)
+        robot = Robot(client, body, joints, joints)
+        robot.set_friction(self.friction)
+        if self.mass != 1.0:
+            robot.scale_mass(self.mass)
+        if self.render_mode is not None:
+            robot.paint((0.8, 0.5, 0.3, 1.0))
+        robot.place(positions)
+        return robot
 
-    def _observe(self) -> tuple[np.ndarray, list[float], float]:
-        """The observation, the joint angles, and minus the distance to go over the time step."""
+    def _reward(
+        self, action: np.ndarray, observation: np.ndarray, gain: float
+    ) -> tuple[float, dict[str, float]]:
+        at_limit = -0.1 * _joints_at_limit(self._angles)
+        return 1.0 + gain + at_limit, {"alive": 1.0, "progress": gain, "joints_at_limit": at_limit}
+
+    def _focus(self) -> Vector:
+        return self._position
+
+    def _observe(self) -> tuple[np.ndarray, float]:
+        """The observation, and minus the distance to go over the time step."""
         client, body = self._robot.client, self._robot.body
-        self._position, orientation = pybullet.getBasePositionAndOrientation(
-            body, physicsClientId=client
-        )
-        linear, angular = pybullet.getBaseVelocity(body, physicsClientId=client)
+        self._position, orientation = pybullet.getBasePositionAndOrientation(body, client)
+        linear, angular = pybullet.getBaseVelocity(body, client)
         angles, speeds = self._robot.states()
+        self._angles = angles
         values = [
             self._position[2],
             *orientation,
@@ -279,7 +228,7 @@ class Ant(gymnasium.Env):
         observation = np.fromiter(values, np.float32, len(values))
         x, y = self._mean_position(orientation, linear, angular, angles, speeds)
         distance = math.hypot(self._goal[0] - x, self._goal[1] - y)
-        return observation, angles, -distance / TIME_STEP
+        return observation, -distance / TIME_STEP
 
     def _mean_position(
         self,

@@ -9,37 +9,33 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
-import gymnasium
 import numpy as np
 import pybullet
 
+from irlcli.envs.bullet.episode import RobotEnv
 from irlcli.envs.bullet.world import (
     FROM_TO_MARGIN,
-    NOT_FINITE,
     SUBSTEPS,
     TIME_STEP,
     Capsule,
     Goal,
     Link,
     Robot,
+    Vector,
     World,
     box_inertia,
-    clipped,
-    is_finite,
     moving_joints,
     require,
     require_friction,
     require_model,
     single,
-    start_positions,
 )
 
 _RADIUS = single(0.046)
 _START_HEIGHT = single(0.7)
 _TORSO_LINK = 2
-_TORQUES = np.array([120.0, 90.0, 60.0, 140.0, 60.0, 30.0])
 
 
 class _Segment(NamedTuple):
@@ -156,7 +152,7 @@ def _leg_height() -> float:
     return -min(lowest)
 
 
-class HalfCheetah(gymnasium.Env):
+class HalfCheetah(RobotEnv):
     """A planar runner.
 
     Observation [17] float32: height (relative to the start) and pitch of the torso, 6 joint
@@ -185,10 +181,9 @@ class HalfCheetah(gymnasium.Env):
         RuntimeError: ``"human"`` without a display.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": round(1.0 / TIME_STEP),
-    }
+    start_range = (0.1,) * 9
+    torques = np.array([120.0, 90.0, 60.0, 140.0, 60.0, 30.0])
+    camera = 3.0, -15.0
 
     def __init__(
         self,
@@ -205,73 +200,12 @@ class HalfCheetah(gymnasium.Env):
         self.leg_length = require("leg_length", leg_length, 0.2, 5.0)
         self.model = require_model(model, self.leg_length)
         self.goal = Goal(goal_y, direction)
-        self.render_mode = render_mode
-        size = 17 + 2 * self.goal.observed
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
-        self._world = World(render_mode)
+        super().__init__(World(render_mode), 17 + 2 * self.goal.observed, render_mode)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; ``options["joint_positions"]`` [9] replaces the drawn start.
-
-        The positions are those of the torso (forward, height, pitch) and of the 6 joints.
-
-        Raises:
-            ValueError: another option, another shape, or a number that is not finite.
-        """
-        super().reset(seed=seed)
-        positions = start_positions(options, 9)
-        if positions is None:
-            positions = self.np_random.uniform(-0.1, 0.1, 9)
-        x, y = self.goal.draw(self.np_random)
-        self._cosine = x / math.hypot(x, y)
-        self._tail = [self._cosine, y / math.hypot(x, y)] if self.goal.observed else []
-        self._world.clear()
-        self._robot = self._place()
-        self._robot.set_friction(self.friction)
-        if self.mass != 1.0:
-            self._robot.scale_mass(self.mass)
-        if self.render_mode is not None:
-            self._robot.paint((0.8, 0.6, 0.4, 1.0))
-        self._robot.place(positions)
-        self._observation, self._forward = self._observe()
-        return self._observation, {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance 0.0165 s.
-
-        Raises:
-            ValueError: an action of another shape, or not finite.
-        """
-        action = clipped(action, 6)
-        self._robot.drive(_TORQUES * action)
-        self._world.step()
-        observation, forward = self._observe()
-        if not (math.isfinite(forward) and is_finite(observation)):
-            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
-        progress = self._cosine * (forward - self._forward) / TIME_STEP
-        control = -0.1 * float(action @ action)
-        self._observation = observation
-        self._forward = forward
-        if self.render_mode == "human":
-            self._world.look_at(self._position(), 3.0)
-        info = {"progress": progress, "control": control}
-        return observation, progress + control, False, False, info
-
-    def render(self) -> np.ndarray | None:
-        """A picture of the HalfCheetah [240, 320, 3] uint8; ``None`` unless ``"rgb_array"``."""
-        if self.render_mode != "rgb_array":
-            return None
-        return self._world.image(self._position(), 3.0)
-
-    def close(self) -> None:
-        """Disconnect from Bullet."""
-        self._world.close()
-
-    def _place(self) -> Robot:
-        """The robot at its start."""
+    def _place(self, positions: np.ndarray) -> Robot:
+        goal = self.goal.draw(self.np_random)
+        self._cosine = goal[0] / math.hypot(*goal)
+        self._tail = self.goal.observation(goal)
         client = self._world.client
         if self.model == "original":
             (body,) = self._world.load("half_cheetah.xml", pybullet.MJCF_COLORS_FROM_FILE)
@@ -279,7 +213,21 @@ class HalfCheetah(gymnasium.Env):
         else:
             body = self._world.build(*morphology(self.leg_length), (0.0, 0.0, 0.0))
             joints = list(range(9))
-        return Robot(client, body, joints, joints[3:])
+        robot = Robot(client, body, joints, joints[3:])
+        robot.set_friction(self.friction)
+        if self.mass != 1.0:
+            robot.scale_mass(self.mass)
+        if self.render_mode is not None:
+            robot.paint((0.8, 0.6, 0.4, 1.0))
+        robot.place(positions)
+        return robot
+
+    def _reward(
+        self, action: np.ndarray, observation: np.ndarray, gain: float
+    ) -> tuple[float, dict[str, float]]:
+        progress = self._cosine * gain / TIME_STEP
+        control = -0.1 * float(action @ action)
+        return progress + control, {"progress": progress, "control": control}
 
     def _observe(self) -> tuple[np.ndarray, float]:
         """The observation, and how far forward the torso is."""
@@ -289,7 +237,6 @@ class HalfCheetah(gymnasium.Env):
         # The original reads a link's cached position, which is one substep old.
         return observation, positions[0] - speeds[0] * TIME_STEP / SUBSTEPS
 
-    def _position(self) -> tuple[float, float, float]:
-        """The torso's position, for the camera."""
+    def _focus(self) -> Vector:
         link = _TORSO_LINK if self.model == "merged" else _TORSO_LINK + 1
         return pybullet.getLinkState(self._robot.body, link, physicsClientId=self._world.client)[0]

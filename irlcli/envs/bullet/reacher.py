@@ -1,33 +1,30 @@
 """The PyBullet Reacher with the gravity intervention of the paper's Sec. 5.2 and Table 2.
 
-Observation, reward and physics are those of pybullet-gym's ReacherBulletEnv.
+Observation, reward and physics are those of pybullet-gym's ReacherBulletEnv, but for gravity,
+which the original has none of.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
 
-import gymnasium
 import numpy as np
 import pybullet
 
+from irlcli.envs.bullet.episode import RobotEnv
 from irlcli.envs.bullet.world import (
     FROM_TO_MARGIN,
     GRAVITY,
-    NOT_FINITE,
     TIME_STEP,
     Capsule,
     Link,
     Robot,
+    Vector,
     World,
     box_inertia,
-    clipped,
-    is_finite,
     require,
     require_model,
     single,
-    start_positions,
 )
 
 _RADIUS = single(0.01)
@@ -36,8 +33,6 @@ _HEIGHT = single(0.01)
 _UPPER = single(0.1)
 _FINGERTIP = single(0.11)
 _ELBOW_LIMIT = 3.0
-_TORQUE = 0.05
-_TARGET_LIMIT = 0.27
 
 
 def morphology() -> tuple[Link, list[Link]]:
@@ -70,8 +65,8 @@ def morphology() -> tuple[Link, list[Link]]:
     return Link(0.0, (0.0, 0.0, 0.0)), links
 
 
-class Reacher(gymnasium.Env):
-    """A two-link arm in a horizontal plane that moves its fingertip to a target.
+class Reacher(RobotEnv):
+    """A two-link arm on a leaning table that moves its fingertip to a target.
 
     Observation [9] float32: target x and y, fingertip minus target x and y, cosine and sine of
     the shoulder's angle, its speed / 10, the elbow's angle / 3, its speed / 10. Action [2]:
@@ -83,11 +78,14 @@ class Reacher(gymnasium.Env):
     finite truncates the episode at its last finite observation, pays nothing, and says so in
     ``info["error"]``.
 
-    Both joints are vertical, so gravity loads their bearings but cannot turn them: the paper
-    finds that gravity plays little role here, and in this model it plays none.
+    On a level table gravity acts along the joints' axes and turns neither: every setting would
+    be the same to the last bit. On a table that leans by ``tilt`` the sine of it pulls toward
+    -y. The motors hold the stretched arm up to 7.3 times gravity at 5 degrees, but not even
+    once on a vertical table.
 
     Args:
-        gravity: multiplier of 9.8 m/s^2 downward, in [0, 20]; the original has none.
+        gravity: multiplier of 9.8 m/s^2, in [0, 20]; the original has none.
+        tilt: of the table, degrees in [0, 90].
         model: ``"merged"`` or ``"original"`` (5 links).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
@@ -96,87 +94,35 @@ class Reacher(gymnasium.Env):
         RuntimeError: ``"human"`` without a display.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": round(1.0 / TIME_STEP),
-    }
+    start_range = (3.14, 3.14, 0.27, 0.27)
+    torques = np.full(2, 0.05)
+    camera = 0.55, -65.0
 
-    def __init__(self, gravity: float = 1.0, model: str = "merged", render_mode: str | None = None):
+    def __init__(
+        self,
+        gravity: float = 1.0,
+        tilt: float = 5.0,
+        model: str = "merged",
+        render_mode: str | None = None,
+    ):
         self.gravity = require("gravity", gravity, 0.0, 20.0)
+        self.tilt = require("tilt", tilt, 0.0, 90.0)
         self.model = require_model(model)
-        self.render_mode = render_mode
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self._world = World(render_mode, self.gravity * GRAVITY, substeps=1, ground=False)
+        strength, angle = self.gravity * GRAVITY, math.radians(self.tilt)
+        pull = 0.0, -strength * math.sin(angle), -strength * math.cos(angle)
+        world = World(render_mode, pull, substeps=1, ground=False)
+        super().__init__(world, 9, render_mode)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; ``options["joint_positions"]`` [4] replaces the drawn start.
-
-        The positions are those of shoulder and elbow, and the target's x and y.
-
-        Raises:
-            ValueError: another option, another shape, or a number that is not finite.
-        """
-        super().reset(seed=seed)
-        positions = start_positions(options, 4)
-        if positions is None:
-            positions = np.concatenate(
-                [
-                    self.np_random.uniform(-3.14, 3.14, 2),
-                    self.np_random.uniform(-_TARGET_LIMIT, _TARGET_LIMIT, 2),
-                ]
-            )
+    def _place(self, positions: np.ndarray) -> Robot:
         self._target = float(positions[2]), float(positions[3])
-        self._world.clear()
-        self._robot = self._place()
-        self._robot.place(positions[:2])
-        self._observation, self._potential = self._observe()
-        return self._observation, {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance 0.0165 s.
-
-        Raises:
-            ValueError: an action of another shape, or not finite.
-        """
-        action = clipped(action, 2)
-        self._robot.drive(_TORQUE * action)
-        self._world.step()
-        observation, potential = self._observe()
-        if not is_finite(observation):
-            return self._observation, 0.0, False, True, {"error": NOT_FINITE}
-        first, second = abs(action[0]), abs(action[1])
-        speeds = abs(float(observation[6])), abs(float(observation[8]))
-        control = -0.1 * (first * speeds[0] + second * speeds[1]) - 0.01 * (first + second)
-        stuck = -0.1 if abs(abs(float(observation[7])) - 1.0) < 0.01 else 0.0
-        progress = potential - self._potential
-        self._observation = observation
-        self._potential = potential
-        if self.render_mode == "human":
-            self._world.look_at((0.0, 0.0, 0.0), 0.6)
-        info = {"progress": progress, "control": control, "stuck": stuck}
-        return observation, progress + control + stuck, False, False, info
-
-    def render(self) -> np.ndarray | None:
-        """A picture of the arm [240, 320, 3] uint8; ``None`` unless ``"rgb_array"``."""
-        if self.render_mode != "rgb_array":
-            return None
-        return self._world.image((0.0, 0.0, 0.0), 0.6)
-
-    def close(self) -> None:
-        """Disconnect from Bullet."""
-        self._world.close()
-
-    def _place(self) -> Robot:
-        """The arm and its target."""
         client = self._world.client
         if self.model == "original":
             *_, arm, target = self._world.load("reacher.xml")
             for joint, position in enumerate(self._target):
                 pybullet.resetJointState(target, joint, position, physicsClientId=client)
-            return Robot(client, arm, (0, 2), (0, 2))
+            robot = Robot(client, arm, (0, 2), (0, 2))
+            robot.place(positions[:2])
+            return robot
         arm = self._world.build(*morphology(), (0.0, 0.0, 0.0))
         for link in range(2):
             # The original's geometries do not collide either.
@@ -195,7 +141,20 @@ class Reacher(gymnasium.Env):
                 basePosition=(*self._target, _HEIGHT),
                 physicsClientId=client,
             )
+        robot.place(positions[:2])
         return robot
+
+    def _reward(
+        self, action: np.ndarray, observation: np.ndarray, gain: float
+    ) -> tuple[float, dict[str, float]]:
+        first, second = np.abs(action).tolist()
+        first_speed, elbow, second_speed = np.abs(observation[6:]).tolist()
+        control = -0.1 * (first * first_speed + second * second_speed) - 0.01 * (first + second)
+        stuck = -0.1 if abs(elbow - 1.0) < 0.01 else 0.0
+        return gain + control + stuck, {"progress": gain, "control": control, "stuck": stuck}
+
+    def _focus(self) -> Vector:
+        return 0.0, 0.0, 0.0
 
     def _observe(self) -> tuple[np.ndarray, float]:
         """The observation and -100 times the fingertip's distance to the target."""

@@ -26,7 +26,6 @@ TIME_STEP = 0.0165
 SUBSTEPS = 4
 GRAVITY = 9.8
 GOAL_DISTANCE = 1000.0
-NOT_FINITE = "the state of the world is not finite"
 
 _SELF_COLLISION = (
     pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
@@ -182,44 +181,13 @@ class Goal:
         angle = math.radians(low if low == high else random.uniform(low, high))
         return GOAL_DISTANCE * math.cos(angle), GOAL_DISTANCE * math.sin(angle)
 
-
-def is_finite(array: np.ndarray) -> bool:
-    """Whether every number of a vector is finite (and far below overflow)."""
-    # One product of the vector with itself is much cheaper than ``np.isfinite(...).all()``.
-    return math.isfinite(array.dot(array))
-
-
-def clipped(action: np.ndarray, size: int) -> np.ndarray:
-    """``action`` [size] as float64, clipped to the actuators' range [-1, 1].
-
-    Raises:
-        ValueError: another shape, or a number that is not finite.
-    """
-    action = np.asarray(action, dtype=np.float64)
-    if action.shape != (size,):
-        raise ValueError(f"action must have shape ({size},), not {action.shape}")
-    if not is_finite(action):
-        raise ValueError(f"action must be finite, not {action.tolist()}")
-    return np.minimum(np.maximum(action, -1.0), 1.0)
+    def observation(self, goal: tuple[float, float]) -> list[float]:
+        """The unit vector to ``goal``, or nothing where the goal is not observed."""
+        norm = math.hypot(*goal)
+        return [goal[0] / norm, goal[1] / norm] if self.observed else []
 
 
-def start_positions(options: dict | None, size: int) -> np.ndarray | None:
-    """``options["joint_positions"]`` [size] of a reset, or ``None`` where not given.
-
-    Raises:
-        ValueError: another option, another shape, or a number that is not finite.
-    """
-    if not options:
-        return None
-    if set(options) != {"joint_positions"}:
-        raise ValueError(f"the only reset option is 'joint_positions', not {sorted(options)}")
-    positions = np.asarray(options["joint_positions"], dtype=np.float64)
-    if positions.shape != (size,) or not np.isfinite(positions).all():
-        raise ValueError(f"joint_positions must be {size} finite numbers, not {positions.tolist()}")
-    return positions
-
-
-def _has_display() -> bool:
+def has_display() -> bool:
     """Whether an X server answers; Bullet's window ends the whole process where none does."""
     if not os.environ.get("DISPLAY"):
         return False
@@ -265,7 +233,7 @@ class World:
 
     Args:
         render_mode: ``None``, ``"rgb_array"`` (software renderer) or ``"human"`` (a window).
-        gravity: downward, m/s^2.
+        gravity: acceleration, m/s^2.
         substeps: solver steps per time step.
         ground: whether there is a floor (friction 0.8, restitution 0.5).
 
@@ -277,7 +245,7 @@ class World:
     def __init__(
         self,
         render_mode: str | None,
-        gravity: float = GRAVITY,
+        gravity: Vector = (0.0, 0.0, -GRAVITY),
         substeps: int = SUBSTEPS,
         ground: bool = True,
     ):
@@ -285,7 +253,7 @@ class World:
             raise ValueError(
                 f"render_mode must be None, 'rgb_array' or 'human', not {render_mode!r}"
             )
-        if render_mode == "human" and not _has_display():
+        if render_mode == "human" and not has_display():
             raise RuntimeError(
                 "render_mode='human' needs a display and none answers; use 'rgb_array'"
             )
@@ -303,7 +271,7 @@ class World:
         """
         client = self.client
         pybullet.resetSimulation(physicsClientId=client)
-        pybullet.setGravity(0.0, 0.0, -self._gravity, physicsClientId=client)
+        pybullet.setGravity(*self._gravity, physicsClientId=client)
         pybullet.setDefaultContactERP(0.9, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
@@ -320,17 +288,22 @@ class World:
 
     def step(self) -> None:
         """Advance one time step."""
-        pybullet.stepSimulation(physicsClientId=self.client)
+        pybullet.stepSimulation(self.client)
 
-    def look_at(self, target: Vector, distance: float) -> None:
-        """Point the window's camera."""
+    def look_at(self, target: Vector, camera: tuple[float, float]) -> None:
+        """Point the window's camera as :meth:`image` does."""
+        distance, pitch = camera
         pybullet.resetDebugVisualizerCamera(
-            distance, 0.0, -30.0, target, physicsClientId=self.client
+            distance, 0.0, pitch, target, physicsClientId=self.client
         )
 
-    def image(self, target: Vector, distance: float) -> np.ndarray:
-        """A picture from behind and above ``target``: [240, 320, 3] uint8."""
-        view = pybullet.computeViewMatrixFromYawPitchRoll(target, distance, 0.0, -30.0, 0.0, 2)
+    def image(self, target: Vector, camera: tuple[float, float]) -> np.ndarray:
+        """A picture of ``target``, which moves to the right: [240, 320, 3] uint8.
+
+        ``camera`` is the distance and the pitch in degrees (negative looks down).
+        """
+        distance, pitch = camera
+        view = pybullet.computeViewMatrixFromYawPitchRoll(target, distance, 0.0, pitch, 0.0, 2)
         projection = pybullet.computeProjectionMatrixFOV(60.0, 320 / 240, 0.01, 100.0)
         _, _, pixels, _, _ = pybullet.getCameraImage(
             320,
@@ -452,7 +425,7 @@ class Robot:
 
     def states(self) -> tuple[list[float], list[float]]:
         """Positions and velocities of the joints read."""
-        states = pybullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
+        states = pybullet.getJointStates(self.body, self.joints, self.client)
         return [state[0] for state in states], [state[1] for state in states]
 
     def drive(self, torques: np.ndarray) -> None:

@@ -1,0 +1,76 @@
+"""How much faster two worker processes step 16 Ants than one, with random actions.
+
+    python -m benchmarks.workers [ROUNDS]
+
+Rounds with one and with two workers alternate, so whatever else the machine does falls on both;
+*by the clock* is the median ratio of neighbouring rounds. It needs two idle cores. *By CPU time*
+needs none: every round takes the same steps, and of each step the least over the rounds of the
+parent's CPU time and of each worker's come nearest to an idle machine's. The parent sleeps while
+workers step, so a step lasts as long as the parent and its slowest worker together.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+
+import numpy as np
+
+from irlcli import envs
+from irlcli.envs.workers import WorkerWorlds
+from irlcli.interventions import parse_setting
+
+WORLDS, STEPS, ROUNDS = 16, 200, 11
+
+
+def cpu_seconds(pid: int) -> float:
+    """CPU time that a sleeping process has used; Linux counts it in nanoseconds."""
+    with open(f"/proc/{pid}/schedstat") as schedstat:
+        return int(schedstat.read().split()[0]) * 1e-9
+
+
+def times(worlds: WorkerWorlds) -> np.ndarray:
+    """Seconds of each step [T, 2 + workers]: clock, parent's CPU, each worker's CPU."""
+    pids = [process.pid for process in worlds._processes]
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (STEPS, WORLDS, 8))
+    worlds.reset(range(WORLDS))
+    rows = []
+    before = np.array([cpu_seconds(pid) for pid in pids])
+    for action in actions:
+        start, start_cpu = time.perf_counter(), time.process_time()
+        worlds.step(action)
+        own = time.perf_counter() - start, time.process_time() - start_cpu
+        after = np.array([cpu_seconds(pid) for pid in pids])
+        rows.append([*own, *(after - before)])
+        before = after
+    return np.array(rows)
+
+
+def main(rounds: int) -> None:
+    """Print a line for each number of workers, and the ratios."""
+    factories = [partial(envs.make, "ant", parse_setting("ant", "default"))] * WORLDS
+    teams = [WorkerWorlds(factories, STEPS + 1, workers) for workers in (1, 2)]
+    rows = [[times(team) for team in teams] for _ in range(rounds)]
+    measured = [np.array(samples) for samples in zip(*rows, strict=True)]
+    for team in teams:
+        team.close()
+    print(f"{WORLDS} Ants, random actions, {rounds} rounds of the same {STEPS} steps")
+    print("ms a step  clock  parent's CPU  slowest worker's CPU")
+    steps = []
+    for workers, samples in enumerate(measured, 1):
+        least = samples.min(axis=0)
+        parent, slowest = least[:, 1].mean(), least[:, 2:].max(axis=1).mean()
+        steps.append(parent + slowest)
+        clock = np.median(samples[:, :, 0].mean(axis=1))
+        label = "1 worker" if workers == 1 else f"{workers} workers"
+        print(f"{label:9s}{1e3 * clock:7.2f}{1e3 * parent:14.3f}{1e3 * slowest:22.3f}")
+    clocks = [samples[:, :, 0].sum(axis=1) for samples in measured]
+    print(
+        f"two workers: {np.median(clocks[0] / clocks[1]):.2f} times as fast by the clock, "
+        f"{steps[0] / steps[1]:.2f} times by CPU time"
+    )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if sys.argv[1:] else ROUNDS)
