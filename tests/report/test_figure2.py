@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from irlcli.report.figure2 import MEASURES, bootstrap_interval, curves, markdown, summary, table
+from irlcli.report.figure2 import MEASURES, curves, markdown, summary, table
 
 
 def quality(variant, setting, seen, values, **more):
@@ -15,15 +15,6 @@ def quality(variant, setting, seen, values, **more):
         | {"seen": seen, **dict.fromkeys(MEASURES, value)}
         for seed, value in enumerate(values)
     ]
-
-
-def test_interval_is_that_of_a_normal_mean():
-    sample = np.random.default_rng(1).normal(3.0, 2.0, 400)
-    low, high = bootstrap_interval(sample)
-    error = 1.96 * sample.std() / 20
-    assert low == pytest.approx(sample.mean() - error, abs=0.02)
-    assert high == pytest.approx(sample.mean() + error, abs=0.02)
-    assert bootstrap_interval(np.full(5, 7.0)) == (7.0, 7.0)
 
 
 def test_worst_is_taken_within_each_dataset_and_among_trained_settings():
