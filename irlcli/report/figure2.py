@@ -99,12 +99,6 @@ def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:
     return {**found, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
 
 
-def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 @dataclass(frozen=True, eq=False)
 class Panel:
     """One recovered reward: [S], and the routes [T + 1] of its optimal policy by setting."""

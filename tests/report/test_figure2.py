@@ -2,9 +2,9 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 
-from irlcli.report.figure2 import MEASURES, curves, markdown, summary, table
+from irlcli.report.figure2 import MEASURES, curves, summary, table
+from irlcli.report.tables import markdown_table
 
 
 def quality(variant, setting, seen, values, **more):
@@ -38,7 +38,7 @@ def test_table_has_a_row_a_variant():
     columns, body = table(summary(pd.DataFrame(rows)), ["c"])
     assert columns[:3] == ["method", "goal probability, worst trained", "goal probability, c"]
     assert body[0][:3] == ["erm", "1.00 [1.00, 1.00]", "0.25 [0.25, 0.25]"]
-    assert markdown(columns[:2], [r[:2] for r in body]).splitlines() == [
+    assert markdown_table(columns[:2], [r[:2] for r in body]).splitlines() == [
         "| method | goal probability, worst trained |",
         "| --- | --- |",
         "| erm | 1.00 [1.00, 1.00] |",
