@@ -737,6 +737,8 @@ def _report_experiment(
         numbers = tuple(int(seed) for seed in (seeds or "0,1,2,3,4").split(","))
     except ValueError:
         raise UsageError(f"--seeds {seeds!r} is no list of seeds", "write 0,1,2,3,4") from None
+    if min(numbers) < 0:
+        raise UsageError(f"--seeds {seeds!r}: no seed -1 or below", "seeds are 0 or more")
     words = ["irl", "report", kind, "--profile", session.profile]
     words += [] if session.settings_file is None else ["--settings", str(session.settings_file)]
     words += [word for item in session.overrides for word in ("--set", item)]

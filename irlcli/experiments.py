@@ -195,11 +195,19 @@ def _row(env, knob, measures, settings, methods, seeds) -> tuple[results.Row, li
         return train_expert.request(env, place, 0, config.expert)
 
     planned = [
-        _Planned(results.Cell(name, agent, "ood"), measured(unseen, None, agent), {})
+        _Planned(
+            results.Cell(name, agent, "ood", place=str(unseen[0])),
+            measured(unseen, None, agent),
+            {},
+        )
         for agent in ("random", "idle")
     ]
     planned.append(
-        _Planned(results.Cell(name, "expert", "ood"), measured(unseen, expert(unseen[0])), {})
+        _Planned(
+            results.Cell(name, "expert", "ood", place=str(unseen[0])),
+            measured(unseen, expert(unseen[0])),
+            {},
+        )
     )
     planned += [
         _Planned(results.Cell(name, "expert", "id", place=str(e)), measured([e], expert(e)), {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,13 +56,18 @@ def _style(ink: str) -> Iterator[None]:
         yield
 
 
-def _svg(figure: plt.Figure) -> str:
-    """``figure`` as an SVG element whose ink is that of the text around it."""
+def _svg(figure: plt.Figure, name: str) -> str:
+    """``figure`` as an SVG element whose ink is that of the text around it.
+
+    Its ids begin with ``name``: several stand on one page.
+    """
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
     plt.close(figure)
     text = buffer.getvalue()
-    return text[text.index("<svg") :].replace(_INK, "currentColor").strip()
+    text = re.sub(r'( id="|url\(#|href="#)', rf"\g<1>{name}-", text[text.index("<svg") :])
+    return text.replace(_INK, "currentColor").strip()
 
 
 def draw_points(directory: Path, plan: Plan, report: Report) -> str:
@@ -72,7 +78,7 @@ def draw_points(directory: Path, plan: Plan, report: Report) -> str:
         figure.savefig(directory / f"{plan.kind}.pdf", metadata={"CreationDate": None})
         plt.close(figure)
     with _style(_INK):
-        return _svg(_points(plan, report))
+        return _svg(_points(plan, report), "points")
 
 
 def _points(plan: Plan, report: Report) -> plt.Figure:
@@ -156,7 +162,7 @@ def learning_curves(plan: Plan, learning: Mapping[str, pd.DataFrame]) -> dict[st
                     if (role := f"{row.name} {method} {seed} {kind}") in learning
                 }
                 if runs:
-                    found[f"{row.name}, {what}"] = _svg(_curves(plan, runs))
+                    found[f"{row.name}, {what}"] = _svg(_curves(plan, runs), f"curves{len(found)}")
     return found
 
 
