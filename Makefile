@@ -91,7 +91,7 @@ define REPORT
 @mkdir -p $(RESULTS)
 made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(ENV) --seeds $(call LIST,$(SEEDS)) \
     --methods $(call LIST,$(METHODS)) --name $(TAG).$(WHAT)) && \
-  install -m 644 $$made/README.md $$made/$(KIND).* $$made/*.csv $(RESULTS)
+  install -m 644 $$made/README.md $$made/$(KIND).* $$made/seeds.csv $$made/comparisons.csv $(RESULTS)
 endef
 
 table2: $(READY)

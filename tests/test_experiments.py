@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from test_architecture import loaded_by
 
 from irlcli.experiments import EXPERIMENTS
 from irlcli.settings import load_settings
@@ -126,6 +127,13 @@ def test_a_report_is_a_function_of_what_it_stands_on(report, irl, table_store, t
     assert "train-expert" in lineage and "train-airl" in lineage
 
 
+def test_a_report_that_is_there_loads_nothing_heavy(report, table_store):
+    assert report("table1", table_store, *ROW).code == 0
+    chosen = ["--methods", "erm,irm", "--seeds", "0,1", *ROW, "--profile", "smoke", *SMALL]
+    assert loaded_by("report", "table1", "--store", str(table_store), *chosen) == "LOADED []"
+    assert loaded_by("report", "table2") == "LOADED []"
+
+
 def test_json_holds_the_tables(report, table_store):
     done = report("table1", table_store, *ROW, "--json")
     value = json.loads(done.out)
@@ -164,7 +172,7 @@ def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path
     assert made.code == 0, made.err
     done = report("table1", copy, *ROW)
     (left_out,) = (n for n in notes(done) if n.startswith("Left out"))
-    assert "1 train-airl run of lunar-lander engine-power=1x engine-power=1.25x irm" in left_out
+    assert "1 run of train-airl, lunar-lander engine-power=1x engine-power=1.25x irm" in left_out
     assert f"({Path(made.out.strip()).name})" in left_out
     assert left_out.endswith("airl.total_steps 1024 instead of 2048.")
     after = Path(done.out.strip())

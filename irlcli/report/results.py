@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from irlcli.report import paper
-from irlcli.report.statistics import compare, holm, identical_seeds, summarise
+from irlcli.report.statistics import compare, holm, identical_runs, summarise
 
 TITLES = {
     "erm": "AIRL-ERM",
@@ -79,13 +79,13 @@ class Report:
     notes: list[str]
 
 
-Episodes = Mapping[tuple[str, str, str], Mapping[int, np.ndarray]]
+Episodes = Mapping[tuple[str, str], Mapping[tuple[str, int], np.ndarray]]
 
 
 def build(plan: Plan, points: pd.DataFrame, episodes: Episodes) -> Report:
     """The report on ``points``: a row per evaluation and setting, as in :class:`Report`.
 
-    ``episodes`` are the true returns by (row, agent, measure) and seed.
+    ``episodes`` are the true returns by (row, measure), then (method, seed).
     """
     cells = _cells(plan, points)
     comparisons = _comparisons(plan, points, cells)
@@ -250,11 +250,12 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
 
 
 def _identical(episodes: Episodes) -> list[str]:
+    """Runs that cannot be told apart: seeds that are no sample, or a method without effect."""
     return [
-        f"Identical: {row}, {TITLES[agent]}, {measure}: seeds {', '.join(map(str, seeds))} have the "
-        "same returns to the bit; they are one run, and p-values with them are too small."
-        for (row, agent, measure), by_seed in episodes.items()
-        for seeds in identical_seeds(by_seed)
+        f"Identical: {row}, {measure}: {', '.join(f'{TITLES[a]} seed {s}' for a, s in runs)} have "
+        "the same returns to the bit: between them neither seed nor method made a difference."
+        for (row, measure), found in episodes.items()
+        for runs in identical_runs(found)
     ]
 
 
@@ -268,10 +269,13 @@ def _without_p(comparisons: pd.DataFrame) -> list[str]:
     ]
 
 
+def _runs(count: int) -> str:
+    return f"{count} run" if count == 1 else f"{count} runs"
+
+
 def _left_out(plan: Plan) -> list[str]:
     return [
-        f"Left out: {len(o.ids)} {o.stage} {'run' if len(o.ids) == 1 else 'runs'} of {o.about} "
-        f"({', '.join(o.ids)}): {o.why}."
+        f"Left out: {_runs(len(o.ids))} of {o.stage}, {o.about} ({', '.join(o.ids)}): {o.why}."
         for o in plan.others
     ]
 
@@ -283,7 +287,7 @@ def _mixed(plan: Plan) -> list[str]:
         if len(origins) > 1:
             parts = [
                 f"commit {(commit or 'unknown')[:10]}{' with changes ' + dirty if dirty else ''}, "
-                f"libraries {libraries}: {len(ids)} runs"
+                f"libraries {libraries}: {_runs(len(ids))}"
                 for (commit, dirty, libraries), ids in origins.items()
             ]
             notes.append(

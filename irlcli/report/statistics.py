@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy import stats
 
 _RESAMPLES = 10_000
+Run = TypeVar("Run")
 
 
 @dataclass(frozen=True)
@@ -124,12 +126,12 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return adjusted
 
 
-def identical_seeds(episodes: Mapping[int, Sequence[float]]) -> list[tuple[int, ...]]:
-    """Groups of seeds whose returns of every episode are the same to the bit.
+def identical_runs(episodes: Mapping[Run, Sequence[float]]) -> list[tuple[Run, ...]]:
+    """Groups of runs whose returns of every episode are the same to the bit.
 
-    Seeds that did the same are one run, whatever they are called.
+    Such runs are one run, whatever their seeds or methods are called.
     """
-    groups: dict[bytes, list[int]] = {}
-    for seed, returns in episodes.items():
-        groups.setdefault(np.asarray(returns, np.float64).tobytes(), []).append(seed)
-    return [tuple(seeds) for seeds in groups.values() if len(seeds) > 1]
+    groups: dict[bytes, list[Run]] = {}
+    for run, returns in episodes.items():
+        groups.setdefault(np.asarray(returns, np.float64).tobytes(), []).append(run)
+    return [tuple(runs) for runs in groups.values() if len(runs) > 1]

@@ -109,12 +109,12 @@ def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
 
 def run(job: Job) -> None:
     """Read the evaluations and write what is said of them; nothing is computed but statistics."""
-    import json
-
     import pandas as pd
 
+    from irlcli import descriptions
     from irlcli.report import curves, pages, results
     from irlcli.stages.outputs import write_json
+    from irlcli.store import read_json
 
     p: Parameters = job.parameters
     points, episodes = [], {}
@@ -122,23 +122,24 @@ def run(job: Job) -> None:
         if not cell.run:
             continue
         directory = job.inputs[cell.role]
-        summary = json.loads((directory / "summary.json").read_text())
+        path = directory / "summary.json"
+        summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         base = {"row": cell.row, "agent": cell.agent, "measure": cell.measure, "seed": cell.seed}
         points += [
             {
                 **base,
-                "setting": place["setting"],
-                "true_return": place["mean_return"],
-                "progress": place["mean_progress"],
-                "episodes": place["episodes"],
+                "setting": place.setting,
+                "true_return": place.mean_return,
+                "progress": place.mean_progress,
+                "episodes": place.episodes,
                 "evaluation": cell.run,
             }
-            for place in summary["settings"]
+            for place in summary.settings
         ]
         if cell.seed is not None:
             returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
-            group = episodes.setdefault((cell.row, cell.agent, cell.measure), {})
-            group[cell.seed] = returns["true_return"].to_numpy()
+            group = episodes.setdefault((cell.row, cell.measure), {})
+            group[cell.agent, cell.seed] = returns["true_return"].to_numpy()
     report = results.build(p, pd.DataFrame(points), episodes)
     learning = {
         role: pd.read_parquet(path)

@@ -180,11 +180,15 @@ def test_missing_seeds_are_counted_and_one_seed_has_no_p():
     assert any(n.startswith("No p-value: lunar-lander bounce: 1 of 3") for n in report.notes)
 
 
-def test_seeds_that_are_one_run_are_named():
-    same = {0: np.array([1.0, 2.0]), 1: np.array([1.0, 2.0]), 2: np.array([1.0, 3.0])}
-    report = results.build(*made(full()), {("lunar-lander bounce", "irm", "transfer"): same})
+def test_runs_that_cannot_be_told_apart_are_named():
+    same = {("irm", s): np.array([1.0, 2.0 + (s == 2)]) for s in range(3)}
+    report = results.build(*made(full()), {("lunar-lander bounce", "transfer"): same})
     (note,) = report.notes
-    assert note.startswith("Identical: lunar-lander bounce, AIRL-IRM, transfer: seeds 0, 1")
+    assert note.startswith("Identical: lunar-lander bounce, transfer: AIRL-IRM seed 0, AIRL-IRM")
+    assert "seed 2" not in note
+    methods = {("irm", 0): same["irm", 0], ("erm", 0): same["irm", 0]}
+    report = results.build(*made(full()), {("lunar-lander bounce", "id"): methods})
+    assert "AIRL-IRM seed 0, AIRL-ERM seed 0 have the same returns" in report.notes[0]
 
 
 def test_other_commits_behind_a_cell_are_marked_also_far_behind_it():
@@ -216,7 +220,7 @@ def test_uncommitted_changes_count_as_another_code():
 def test_runs_made_otherwise_are_counted_and_named():
     others = Others(stage="train-airl", about="x irm", why="seed 1 instead of 0", ids=("aa", "bb"))
     (note,) = results.build(*made(full(), others=(others,)), {}).notes
-    assert note == "Left out: 2 train-airl runs of x irm (aa, bb): seed 1 instead of 0."
+    assert note == "Left out: 2 runs of train-airl, x irm (aa, bb): seed 1 instead of 0."
 
 
 class Tags(HTMLParser):

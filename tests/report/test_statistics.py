@@ -13,7 +13,7 @@ from irlcli.report.statistics import (
     bootstrap_interval,
     compare,
     holm,
-    identical_seeds,
+    identical_runs,
     interquartile_mean,
     probability_of_improvement,
     summarise,
@@ -146,7 +146,7 @@ def test_summary_of_few_seeds():
     assert summarise([0.1, 0.1, 0.1]).deviation == 0.0
 
 
-def test_identical_seeds_are_found_to_the_bit():
+def test_identical_runs_are_found_to_the_bit():
     episodes = {0: [1.0, 2.0], 1: [1.0, 2.5], 2: [1.0, 2.0], 3: [1.0, 2.5 + 1e-15]}
-    assert identical_seeds(episodes) == [(0, 2)]
-    assert identical_seeds({0: [1.0]}) == []
+    assert identical_runs(episodes) == [(0, 2)]
+    assert identical_runs({0: [1.0]}) == []
