@@ -37,6 +37,8 @@ test: $(READY)
 
 bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.airl
+	$(VENV)/bin/python -m benchmarks.airl --env ant --rounds 2
+	$(VENV)/bin/python -m benchmarks.parallel
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \

@@ -1,16 +1,19 @@
 """Where the time of adversarial IRL goes, against stepping the bare environment.
 
-Everything is measured in this one process, alternating bare stepping and training rounds, so
-that a change of the machine's speed meets both alike. Run by ``make bench``.
+Everything is measured in this one process and in its CPU seconds, alternating bare stepping and
+training rounds, so that other load and a change of the machine's speed meet both alike. Run by
+``make bench``.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from collections import defaultdict
 from collections.abc import Callable
 
+import gymnasium
 import numpy as np
 import torch
 
@@ -20,7 +23,11 @@ from irlcli.interventions import parse_settings
 from irlcli.settings import load_settings
 from irlcli.stages.adversary import Adversary
 
-INTERVENTIONS = {"lunar-lander": "engine-power=1x,1.25x"}
+INTERVENTIONS = {
+    "lunar-lander": "engine-power=1x,1.25x",
+    "ant": "leg-length=1x,2x",
+    "half-cheetah": "leg-length=0.7,1.3",
+}
 
 
 def main() -> None:
@@ -29,9 +36,10 @@ def main() -> None:
     parser.add_argument("--env", default="lunar-lander", choices=sorted(INTERVENTIONS))
     parser.add_argument("--profile", default="standard")
     parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--intervention", help="KNOB=VALUE,... in place of the usual one")
     arguments = parser.parse_args()
     config = load_settings(arguments.env, arguments.profile).airl
-    settings = parse_settings(arguments.env, INTERVENTIONS[arguments.env])
+    settings = parse_settings(arguments.env, arguments.intervention or INTERVENTIONS[arguments.env])
 
     bare = rl.make_worlds(arguments.env, settings, config.ppo.n_envs)
     worlds = rl.make_worlds(arguments.env, settings, config.ppo.n_envs)
@@ -58,14 +66,14 @@ def main() -> None:
             seconds.clear()
             steps = 0
         count = trainer.steps_per_round
-        started = time.perf_counter()
+        started = time.process_time()
         _step_bare(bare, count, index + 1)
-        seconds["bare stepping"] += time.perf_counter() - started
-        started = time.perf_counter()
+        seconds["bare stepping"] += time.process_time() - started
+        started = time.process_time()
         rollouts = trainer.train_round(index + 1, reward)
-        policy_done = time.perf_counter()
+        policy_done = time.process_time()
         adversary.train_round(index + 1, rollouts, trainer.policy)
-        ended = time.perf_counter()
+        ended = time.process_time()
         seconds["discriminator"] += ended - policy_done
         seconds["AIRL in all"] += ended - started
         steps += count
@@ -73,21 +81,24 @@ def main() -> None:
     parts = ("environment", "policy forward and buffer", "rewards", "PPO update", "discriminator")
     seconds["rest"] = seconds["AIRL in all"] - sum(seconds[part] for part in parts)
 
-    print(f"{arguments.env}, profile {arguments.profile}, {steps:,} steps, one process")
-    print(f"{'part':28}{'ms / 1000 steps':>16}{'share':>8}{'x bare':>8}")
+    print(
+        f"{arguments.env}, {len(settings)} settings, profile {arguments.profile}, {steps:,} steps, "
+        f"one process, at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB"
+    )
+    print(f"{'part':28}{'CPU ms / 1000 steps':>20}{'share':>8}{'x bare':>8}")
     for part in ("bare stepping", *parts, "rest", "AIRL in all"):
         share = "" if part == "bare stepping" else f"{seconds[part] / seconds['AIRL in all']:.0%}"
         ratio = seconds[part] / seconds["bare stepping"]
-        print(f"{part:28}{1e6 * seconds[part] / steps:16.1f}{share:>8}{ratio:8.2f}")
+        print(f"{part:28}{1e6 * seconds[part] / steps:20.1f}{share:>8}{ratio:8.2f}")
 
 
 def _timed(function: Callable, seconds: dict[str, float], part: str) -> Callable:
     def timed(*arguments, **keywords):
-        started = time.perf_counter()
+        started = time.process_time()
         try:
             return function(*arguments, **keywords)
         finally:
-            seconds[part] += time.perf_counter() - started
+            seconds[part] += time.process_time() - started
 
     return timed
 
@@ -98,7 +109,7 @@ def _step_bare(worlds, steps: int, seed: int) -> None:
     space = worlds.action_space
     for i, env in enumerate(worlds.envs):
         env.reset(seed=seed * 1000 + i)
-        actions = rng.integers(space.n, size=steps // len(worlds.envs)).tolist()
+        actions = _random_actions(space, steps // len(worlds.envs), rng)
         length = 0
         for action in actions:
             _, _, terminated, truncated, _ = env.step(action)
@@ -106,6 +117,12 @@ def _step_bare(worlds, steps: int, seed: int) -> None:
             if terminated or truncated or length >= worlds.max_episode_steps:
                 env.reset()
                 length = 0
+
+
+def _random_actions(space, count: int, rng: np.random.Generator):
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return rng.integers(space.n, size=count).tolist()
+    return rng.uniform(space.low, space.high, size=(count, *space.shape)).astype(np.float32)
 
 
 if __name__ == "__main__":

@@ -62,13 +62,10 @@ class Session:
 
         With --json, ``table`` is the JSON output that is printed with the artefact.
         """
-        from irlcli.runner import Runner
-
         if name is not None:
             # Before the work, not after it.
             self.store.check_name(name)
-        command = ["irl", *sys.argv[1:]]
-        runner = Runner(self.store, self.console, self._wait, command, workers=self._workers)
+        runner = self._runner()
         if self._dry_run:
             self._print_plan([step for request in requests for step in runner.plan(request)])
             return []
@@ -102,6 +99,27 @@ class Session:
         from irlcli.store import read_json
 
         return read_json(self.store.open(artefact, output))
+
+    def prepare(self, request: Any, then: str) -> Any | None:
+        """The artefact of ``request``, unprinted; with --dry-run, None if ``then`` has to wait."""
+        from irlcli.runner import Step
+
+        runner = self._runner()
+        if not self._dry_run:
+            try:
+                return runner.run(request)
+            finally:
+                self.console.close()
+        steps = runner.plan(request)
+        if steps[-1].artefact is None:
+            self._print_plan([*steps, Step("BLOCKED", then, f"waits for {request.label}")])
+        return steps[-1].artefact
+
+    def _runner(self) -> Any:
+        from irlcli.runner import Runner
+
+        command = ["irl", *sys.argv[1:]]
+        return Runner(self.store, self.console, self._wait, command, workers=self._workers)
 
     def _print_plan(self, steps: Sequence[Any]) -> None:
         if self.as_json:
@@ -220,24 +238,65 @@ def train_airl(
         str | None, typer.Option(help="erm, erm-balanced, irm or irm-shuffled.")
     ] = None,
     penalty_weight: Annotated[float | None, typer.Option(help="lambda of IRM.")] = None,
+    choose_penalty: Annotated[
+        str | None,
+        typer.Option(help="Candidates for lambda, e.g. 0.1,1,10: leave one setting out."),
+    ] = None,
+    select: Annotated[
+        str | None, typer.Option(help="Round to keep: last, or best on episodes or on SETTING.")
+    ] = None,
     state_only: Annotated[bool, typer.Option("--state-only", help="g(s), not g(s, a).")] = False,
     seed: Seed = 0,
     name: Name = None,
 ) -> None:
     """Learn a reward and a student policy from demonstrations."""
+    import msgspec
+
     from irlcli.interventions import parse_setting
     from irlcli.references import demonstrations
+    from irlcli.runner import source_of
+    from irlcli.stages import choose_penalty as choice
     from irlcli.stages import train_airl
+    from irlcli.store import Resolved, read_json
 
     source, env, settings = demonstrations(session.store, demos)
     flags = {
         "airl.method": method,
         "airl.penalty_weight": penalty_weight,
+        "airl.select": str(parse_setting(env, select)) if "=" in (select or "") else select,
         "airl.state_only": state_only or None,
     }
-    config = session.settings(env, flags)
+    airl = session.settings(env, flags).airl
     parsed = [parse_setting(env, text) for text in settings]
-    session.deliver([train_airl.request(source, env, parsed, config.airl, seed)], name)
+    # Before the choice of lambda, which takes long.
+    train_airl.request(source, env, parsed, airl, seed)
+    basis = {}
+    if choose_penalty is not None:
+        if penalty_weight is not None:
+            raise UsageError("--penalty-weight and --choose-penalty both set lambda", "give one")
+        weights = _numbers("--choose-penalty", choose_penalty)
+        request = choice.request(source, env, parsed, airl, weights, seed)
+        chosen = session.prepare(request, "train-airl")
+        if chosen is None:
+            return
+        path = session.store.open(chosen, "choice.json")
+        made = msgspec.convert(read_json(path), choice.Choice)
+        session.console.say(f"lambda {made.chosen:g} did best of {choose_penalty} ({path})")
+        airl = msgspec.structs.replace(airl, penalty_weight=made.chosen)
+        basis["penalty choice"] = source_of(Resolved(chosen, path))
+    session.deliver([train_airl.request(source, env, parsed, airl, seed, basis)], name)
+
+
+def _numbers(flag: str, text: str) -> list[float]:
+    import math
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+        if all(math.isfinite(x) and x >= 0 for x in numbers):
+            return numbers
+    except ValueError:
+        pass
+    raise UsageError(f"{flag} {text!r} is no list of numbers from 0 up", "write 0.1,1,10")
 
 
 @command("train-maxent")

@@ -42,7 +42,7 @@ class TerminalConsole:
         self._started, self._first_done = time.monotonic(), None
         self._printed = self._started - _PLAIN_SECONDS
         self._close_live()
-        self._say(f"{'RESUME' if resumed else 'RUN'} {label}")
+        self.say(f"{'RESUME' if resumed else 'RUN'} {label}")
 
     def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
         """How far the present stage is."""
@@ -59,7 +59,7 @@ class TerminalConsole:
             self._draw(done, total, detail)
         elif now - self._printed >= _PLAIN_SECONDS or done >= total:
             self._printed = now
-            self._say(f"  {self._label}: {done:,}/{total:,} {unit}  {detail}")
+            self.say(f"  {self._label}: {done:,}/{total:,} {unit}  {detail}")
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Mirror metrics to TensorBoard, if asked."""
@@ -77,7 +77,7 @@ class TerminalConsole:
 
     def wait(self, label: str, holder: str) -> None:
         """Another process makes the same artefact."""
-        self._say(f"WAIT {label}: {holder} is making it")
+        self.say(f"WAIT {label}: {holder} is making it")
 
     def finish(self, artefact: Artefact, hit: bool) -> None:
         """A stage ended, or its artefact was there."""
@@ -87,9 +87,9 @@ class TerminalConsole:
             self._writer = None
         record = artefact.manifest.record
         if hit:
-            self._say(f"HIT {record.stage} {artefact.id}")
+            self.say(f"HIT {record.stage} {artefact.id}")
         else:
-            self._say(f"DONE {self._label}: {artefact.directory}")
+            self.say(f"DONE {self._label}: {artefact.directory}")
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -121,7 +121,7 @@ class TerminalConsole:
             self._live.stop()
             self._live = None
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
         if not self._quiet:
             self._print(text)
 

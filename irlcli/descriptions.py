@@ -42,10 +42,18 @@ class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     gamma: Discount
 
 
+class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which round was kept, and its score: a mean log-likelihood, or a mean true return."""
+
+    round: Annotated[int, Meta(ge=0)]
+    score: Finite
+
+
 class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """``reward.json``, and the description inside ``reward.pt``.
 
-    ``scale`` is the standard deviation of g on the training data.
+    ``scale`` is the standard deviation of g on the training data. ``selected`` is there if the
+    round was chosen on held-out data, else it is the last.
     """
 
     env: str
@@ -55,6 +63,7 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     airl: AIRLSettings
     network: RewardNetwork
     scale: Positive
+    selected: Selected | None = None
 
 
 class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -2,8 +2,8 @@
 
 PPO is trained in *rounds*. A round seeds every generator from (seed, round), starts fresh
 episodes, collects one or more rollouts and updates on each. What leaves a round is only the
-network, its optimiser, running moments and a step count, so a run continued from any round's checkpoint equals
-an uninterrupted one byte for byte on the same machine.
+network, its optimiser, running moments and a step count, so a run continued from any round's
+checkpoint equals an uninterrupted one byte for byte on the same machine.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from msgspec import UNSET
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -177,7 +178,7 @@ class PPOTrainer:
         purpose: the stage; stages of one seed share neither initial weights nor worlds.
 
     Raises:
-        UsageError: gSDE, where actions are discrete.
+        UsageError: gSDE or a standard deviation, where actions are discrete.
     """
 
     def __init__(self, worlds: Worlds, ppo: PPOSettings, total_steps: int, seed: int, purpose: str):
@@ -186,8 +187,13 @@ class PPOTrainer:
         self.total_steps = total_steps
         self._seed = seed
         self._purpose = purpose
-        if ppo.use_sde and isinstance(worlds.action_space, gymnasium.spaces.Discrete):
-            raise UsageError("gSDE needs continuous actions", "leave ppo.use_sde unset")
+        if isinstance(worlds.action_space, gymnasium.spaces.Discrete):
+            for name in ("use_sde", "log_std_init", "log_std_max"):
+                value = getattr(ppo, name)
+                if value is not UNSET and value is not False:
+                    raise UsageError(
+                        f"ppo.{name} needs continuous actions", f"leave ppo.{name} unset"
+                    )
         self._venv = _RecordingVecEnv(worlds)
         self._reward_moments = _moments(0.0, 1.0, 0.0)
         self._discounted = np.zeros(len(worlds))
@@ -225,12 +231,12 @@ class PPOTrainer:
     @property
     def steps_per_round(self) -> int:
         """Environment steps of one round."""
-        return self.ppo.rollouts_per_round * self.ppo.n_steps * self._venv.num_envs
+        return _steps_per_round(self.ppo)
 
     @property
     def rounds(self) -> int:
         """Rounds that make up at least ``total_steps``."""
-        return -(-self.total_steps // self.steps_per_round)
+        return rounds(self.ppo, self.total_steps)
 
     @property
     def policy(self) -> Policy:
@@ -276,6 +282,9 @@ class PPOTrainer:
                 # SB3 schedules the learning rate and the clip range only.
                 self.model.ent_coef = self.ppo.ent_coef * remaining
             self.model.train()
+            if self.ppo.log_std_max is not UNSET:
+                with torch.no_grad():
+                    self.model.policy.log_std.clamp_(max=self.ppo.log_std_max)
             if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
                 raise StageFailed(
                     f"the policy's parameters are not finite after an update in round {index}",
@@ -361,6 +370,15 @@ class PPOTrainer:
         self.model.num_timesteps = int(state["steps"])
         # Checkpoints from before rewards could be normalised have none.
         self._reward_moments = _moments(*state.get("reward_moments", (0.0, 1.0, 0.0)))
+
+
+def _steps_per_round(ppo: PPOSettings) -> int:
+    return ppo.rollouts_per_round * ppo.n_steps * ppo.n_envs
+
+
+def rounds(ppo: PPOSettings, total_steps: int) -> int:
+    """Rounds that make up at least ``total_steps``."""
+    return -(-total_steps // _steps_per_round(ppo))
 
 
 class Policy:

@@ -61,8 +61,10 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     activation: Activation = "tanh"
     ortho_init: bool = True
     # For continuous actions. Unset is off (or SB3's default) and not part of an artefact's key:
-    # what was made before these settings existed is still found.
+    # what was made before these settings existed is still found. Where actions beyond the bounds
+    # are clipped, ``log_std_max`` bounds an entropy that would cost the policy nothing.
     log_std_init: Finite | UnsetType = UNSET
+    log_std_max: Finite | UnsetType = UNSET
     normalise_observations: bool | UnsetType = UNSET
     normalise_rewards: bool | UnsetType = UNSET
     use_sde: bool | UnsetType = UNSET
@@ -119,6 +121,12 @@ class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     pairing: Literal["matched", "pooled"] = "matched"
     policy_reward: Literal["f-log-pi", "f", "g"] = "f-log-pi"
     fixed_horizon: bool = True
+    # Which round is kept: the ``last``, as where unset, or the best on ``episodes`` held out of
+    # every setting's demonstrations, or in one setting of these (``leg-length=1x``), which is
+    # left out of training. Scored every so many rounds, a setting over so many episodes.
+    select: str | UnsetType = UNSET
+    select_every: Count | UnsetType = UNSET
+    select_episodes: Count | UnsetType = UNSET
     ppo: PPOSettings = PPOSettings()
 
 

@@ -64,6 +64,7 @@ LIGHT = [
     "stages/train_expert",
     "stages/collect_experts",
     "stages/train_airl",
+    "stages/choose_penalty",
     "stages/train_maxent",
     "stages/sweep_maxent",
     "stages/figure2",

@@ -15,6 +15,7 @@ from irlcli.store import Store
 # The real stages at the smoke profile, checkpointing after every round; prints the id.
 CHAIN = """
 import sys
+import msgspec
 from irlcli.interventions import parse_setting, parse_settings
 from irlcli.runner import Runner
 from irlcli.settings import load_settings
@@ -26,7 +27,9 @@ def request(stage):
     demos = collect_experts.request("lunar-lander", settings, config)
     if stage == "collect-experts":
         return demos
-    reward = train_airl.request(From(demos), "lunar-lander", settings, config.airl, seed=3)
+    # Each of the rounds is scored, so that the best one has to outlive the kill too.
+    airl = msgspec.structs.replace(config.airl, select="episodes", select_every=1)
+    reward = train_airl.request(From(demos), "lunar-lander", settings, airl, seed=3)
     if stage == "train-airl":
         return reward
     setting = parse_setting("lunar-lander", "engine-power=1.5x")

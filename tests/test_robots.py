@@ -9,12 +9,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from msgspec import UNSET
 from PIL import Image
 
 from irlcli import envs, rl
 from irlcli.checkpoints import from_bytes, to_bytes
 from irlcli.envs.vector import VectorWorlds
-from irlcli.errors import StageFailed
+from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import environment, parse_setting, parse_settings
 from irlcli.seeds import derive
 from irlcli.settings import PPOSettings, load_settings
@@ -57,6 +58,24 @@ def test_the_action_seen_by_all_is_the_unclipped_sample():
         np.testing.assert_array_equal(rollout.observations[t, 0], observation)
         observation, paid, *_ = world.step(np.clip(rollout.actions[t, 0], -1.0, 1.0))
         assert rollout.true_rewards[t, 0] == paid
+
+
+def test_the_cap_on_the_deviation_holds_after_every_round():
+    """A reward that pays for large actions would raise it: the learning rate sees to that."""
+    deviations = {}
+    for cap in (UNSET, -0.5):
+        trainer = make_trainer(log_std_init=-0.6, log_std_max=cap, learning_rate=0.05, n_epochs=4)
+        for index in range(3):
+            trainer.train_round(index, lambda rollout: (rollout.actions**2).sum(-1))
+        deviations[cap] = trainer.model.policy.log_std.detach().numpy()
+    assert deviations[UNSET].max() > -0.5
+    assert deviations[-0.5].max() == np.float32(-0.5)
+
+
+def test_a_cap_needs_continuous_actions():
+    worlds = rl.make_worlds("lunar-lander", [parse_setting("lunar-lander", "bounce=0.5")], 1)
+    with pytest.raises(UsageError, match="ppo.log_std_max needs continuous actions"):
+        rl.PPOTrainer(worlds, PPOSettings(n_envs=1, log_std_max=-1.0), 1000, 0, "test")
 
 
 def test_demonstrations_hold_the_unclipped_sample():
@@ -298,7 +317,7 @@ def test_play_refuses_a_damaged_policy(chains, irl, tmp_path):
                 *("collect-experts", "--env", "lunar-lander", "--intervention", "bounce=0.1"),
                 *("--profile", "smoke", "--set", "expert.ppo.use_sde=true"),
             ],
-            "gSDE needs continuous actions",
+            "ppo.use_sde needs continuous actions",
         ),
         (["evaluate", "--idle", "--env", "reacher", "--ood", "gravity=21x"], "0 to 20"),
         (["evaluate", "--idle", "--env", "ant", "--ood", "friction=1"], "as triple"),

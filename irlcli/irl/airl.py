@@ -7,8 +7,8 @@ Absorbing states. Where episodes may end early, the sign of a learned reward alo
 the task (Kostrikov et al. 2019). With an absorbing state after termination and the time limit
 bootstrapped through, as a truncation is, the value of the state that ended the episode is the
 geometric series f_abs / (1 - gamma): it is added in closed form instead of being stepped
-through, and the discriminator sees each absorbing state as often as stepping on to the horizon would show
-it. (Episodes that a round cuts off never get that far: their absorbing states go unseen.)
+through, and the discriminator sees each absorbing state as often as stepping on to the horizon
+would show it.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def discriminator_losses(
 
 
 def penalty_weight_at(round_index: int, weight: float, warmup: int, ramp: int) -> float:
-    """lambda of a round: 0 for ``warmup`` rounds, then linear over ``ramp`` rounds to ``weight``."""
+    """lambda of a round: 0 for ``warmup`` rounds, then linear over ``ramp`` to ``weight``."""
     if round_index < warmup:
         return 0.0
     return weight * min(1.0, (round_index - warmup + 1) / max(1, ramp))

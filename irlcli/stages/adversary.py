@@ -244,6 +244,16 @@ class Adversary:
             for d in state["past"]
         ]
 
+    def reward_state(self) -> dict[str, Any]:
+        """A copy of the reward as it is now."""
+        tensors = self.model.state_dict().items()
+        return {"model": {name: t.clone() for name, t in tensors}, "scale": self._scale}
+
+    def load_reward_state(self, state: Mapping[str, Any]) -> None:
+        """Go back to the reward of ``reward_state()``."""
+        self.model.load_state_dict(state["model"])
+        self._scale = state["scale"]
+
     def write_reward(self, directory: Path, **origin: Any) -> None:
         """Write ``reward.pt`` and, for readers without torch, ``reward.json``.
 

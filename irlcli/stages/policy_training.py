@@ -14,6 +14,7 @@ from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
 from irlcli.stages import Job
 from irlcli.stages.adversary import Adversary
 from irlcli.stages.outputs import shown
+from irlcli.stages.selection import Selection
 
 Row = dict[str, Any]
 
@@ -24,11 +25,13 @@ def train_rounds(
     settings: Sequence[str],
     reward: RewardFunction | None = None,
     adversary: Adversary | None = None,
+    selection: Selection | None = None,
 ) -> list[Row]:
     """Train from the last checkpoint to the end; returns one row per round and setting.
 
     The policy is paid by ``adversary``, which learns from every round's rollouts, else by
-    ``reward``, else by the true reward.
+    ``reward``, else by the true reward. With ``selection``, the networks of the best round are
+    in place at the end instead of the last one's.
     """
     first, rows = 0, []
     if adversary is not None:
@@ -38,6 +41,8 @@ def train_rounds(
         trainer.load_state_dict(state["trainer"])
         if adversary is not None:
             adversary.load_state_dict(state["adversary"])
+        if selection is not None:
+            selection.load_state_dict(state["selection"])
         first, rows = state["round"], json.loads(state["rows"])
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
@@ -48,19 +53,30 @@ def train_rounds(
                 newest, adversary.train_round(index, rollouts, trainer.policy), strict=True
             ):
                 row.update(diagnostics)
+        if selection is not None:
+            score = selection.consider(index, trainer.policy, adversary)
+            for row in newest:
+                row["score"] = score
         rows += newest
         _report(job, trainer, newest)
-        job.checkpoints.offer(partial(_state, trainer, adversary, index + 1, rows))
+        job.checkpoints.offer(partial(_state, trainer, adversary, selection, index + 1, rows))
+    if selection is not None:
+        selection.restore(trainer.policy, adversary)
     return rows
 
 
 def _state(
-    trainer: PPOTrainer, adversary: Adversary | None, rounds_done: int, rows: Sequence[Row]
+    trainer: PPOTrainer,
+    adversary: Adversary | None,
+    selection: Selection | None,
+    rounds_done: int,
+    rows: Sequence[Row],
 ) -> bytes:
     return checkpoints.to_bytes(
         {
             "trainer": trainer.state_dict(),
             "adversary": adversary.state_dict() if adversary is not None else {},
+            "selection": selection.state_dict() if selection is not None else {},
             "round": rounds_done,
             "rows": json.dumps(rows),
         }

@@ -1,4 +1,4 @@
-"""Which transitions the discriminator sees: whole episodes, in the groups that the method asks for."""
+"""Which transitions the discriminator sees: whole episodes, in the groups of the method."""
 
 import msgspec
 import numpy as np
