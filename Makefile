@@ -5,6 +5,7 @@
 #   SEEDS="0 1 2"                  seeds of the reward learning
 #   METHODS="erm irm"              of erm, irm, erm-balanced, irm-shuffled
 #   SET="--set FIELD=VALUE"        more settings, for every command
+#   CHOOSE="--choose-penalty 1,10" lambda of the penalised methods by leaving a setting out
 #   STORE=DIR                      artefact store
 #   RUN="srun -c2"                 put before every irl command, e.g. to spread over a cluster
 #
@@ -91,7 +92,7 @@ RESULTS ?= docs/results/$(WHAT)
 
 define REPORT
 @mkdir -p $(RESULTS)
-made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(ENV) --seeds $(call LIST,$(SEEDS)) \
+made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(CHOOSE) $(ENV) --seeds $(call LIST,$(SEEDS)) \
     --methods $(call LIST,$(METHODS)) --name $(TAG).$(WHAT)) && \
   install -m 644 $$made/README.md $$made/$(KIND).* $$made/seeds.csv $$made/comparisons.csv $(RESULTS)
 endef
@@ -157,7 +158,8 @@ endef
 # $(1) name, $(2) name of the row, $(3) KNOB, $(4) method, $(5) seed
 define CELL
 $(NAMES)/$(1): $(NAMES)/$(2).demos FORCE
-	$$(RUN) $(IRL) train-airl --demos $$(<F) --method $(4) --seed $(5) $$(COMMON) --name $$(@F)
+	$$(RUN) $(IRL) train-airl --demos $$(<F) --method $(4) --seed $(5) $(if $(filter irm%,$(4)),$$(CHOOSE)) \
+	    $$(COMMON) --name $$(@F)
 
 $(NAMES)/$(1).zero-shot-returns: $(NAMES)/$(1) FORCE
 	$$(RUN) $(IRL) evaluate --policy $$(<F) --ood $(3) $$(COMMON) --name $$(@F)

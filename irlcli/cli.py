@@ -742,6 +742,9 @@ def report(
         str | None, typer.Option(help="erm,irm,erm-balanced,irm-shuffled by default.")
     ] = None,
     env: Annotated[str | None, typer.Option(help="Only this environment's rows.")] = None,
+    choose_penalty: Annotated[
+        str | None, typer.Option(help="Candidates for lambda that train-airl chose from.")
+    ] = None,
     form: Annotated[
         str | None, typer.Option("--format", help="Of table2: text, markdown or latex.")
     ] = None,
@@ -750,7 +753,12 @@ def report(
     """Put results side by side: ``irl report returns REF...``, ``irl report table1``."""
     if kind not in _REPORTS.split(", "):
         raise UsageError(f"unknown report {kind!r}", f"known: {_REPORTS}")
-    compared = {"--seeds": seeds, "--methods": methods, "--env": env}
+    compared = {
+        "--seeds": seeds,
+        "--methods": methods,
+        "--env": env,
+        "--choose-penalty": choose_penalty,
+    }
     if kind in ("returns", "figure2", "table2"):
         _refuse(kind, {**compared, "--format": form if kind != "table2" else None})
     else:
@@ -768,7 +776,7 @@ def report(
     elif kind == "table2":
         _print_table2(session, form or "text")
     else:
-        _report_experiment(session, kind, methods, seeds, env, name)
+        _report_experiment(session, kind, methods, seeds, env, choose_penalty, name)
 
 
 def _refuse(kind: str, options: dict[str, Any]) -> None:
@@ -783,6 +791,7 @@ def _report_experiment(
     methods: str | None,
     seeds: str | None,
     env: str | None,
+    choose_penalty: str | None,
     name: str | None,
 ) -> None:
     import shlex
@@ -803,8 +812,19 @@ def _report_experiment(
     words += [word for item in session.overrides for word in ("--set", item)]
     words += ["--seeds", ",".join(map(str, numbers)), "--methods", ",".join(chosen)]
     words += [] if env is None else ["--env", env]
+    candidates: Sequence[float] = ()
+    if choose_penalty is not None:
+        words += ["--choose-penalty", choose_penalty]
+        candidates = _numbers("--choose-penalty", choose_penalty)
     request = experiments.request(
-        kind, Runner(session.store), session.settings, chosen, numbers, shlex.join(words), env
+        kind,
+        Runner(session.store),
+        session.settings,
+        chosen,
+        numbers,
+        shlex.join(words),
+        env,
+        candidates,
     )
     for artefact in session.deliver([request], name, table=f"{kind}.json"):
         if not session.as_json:

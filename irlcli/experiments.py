@@ -13,11 +13,12 @@ import msgspec
 from irlcli.errors import NotFound, UsageError
 from irlcli.interventions import parse_settings
 from irlcli.runner import Runner, Step, source_of
-from irlcli.settings import Settings
+from irlcli.settings import PENALISED, Settings
 from irlcli.stages import (
     From,
     Request,
     Source,
+    choose_penalty,
     collect_experts,
     evaluate,
     results,
@@ -25,7 +26,7 @@ from irlcli.stages import (
     train_expert,
     transfer,
 )
-from irlcli.store import Artefact, Resolved, digest
+from irlcli.store import Artefact, Resolved, digest, read_json
 
 METHODS = ("erm", "irm", "erm-balanced", "irm-shuffled")
 _STAGES = ("expert", "demonstrations", "airl", "transfer", "evaluation")
@@ -76,6 +77,7 @@ class _Plans:
 
     def __init__(self, runner: Runner):
         self._runner = runner
+        self.store = runner.store
         self._made: dict[int, tuple[Request, list[Step]]] = {}
 
     def __call__(self, request: Request) -> list[Step]:
@@ -93,6 +95,7 @@ def request(
     seeds: Sequence[int],
     command: str,
     env: str | None = None,
+    candidates: Sequence[float] = (),
 ) -> Request:
     """The report ``kind`` on what ``runner``'s store holds of it.
 
@@ -103,6 +106,7 @@ def request(
         methods, seeds: of the reward learning.
         command: how to ask for this report again; printed in it.
         env: only this environment's rows.
+        candidates: for lambda, where it was chosen by ``train-airl --choose-penalty``.
 
     Raises:
         UsageError: a method or a seed that is unknown or named twice; no row of ``env``.
@@ -115,12 +119,13 @@ def request(
     if not wanted:
         names = sorted({row[0] for row in experiment.rows})
         raise UsageError(f"{kind} has no row of {env!r}", f"its environments: {', '.join(names)}")
+    plan = _Plans(runner)
+    learner = _Learner(plan, settings, candidates)
     rows, planned = [], []
     for name, knob in wanted:
-        row, cells = _row(name, knob, experiment.measures, settings, methods, seeds)
+        row, cells = _row(name, knob, experiment.measures, settings, methods, seeds, learner)
         rows.append(row)
         planned += cells
-    plan = _Plans(runner)
     cells, runs, sources, expected = [], {}, {}, {}
     for item in planned:
         steps = plan(item.request)
@@ -160,6 +165,34 @@ def request(
     return results.request(parameters, sources)
 
 
+class _Learner(NamedTuple):
+    """Requests for learned rewards, as ``train-airl`` makes them."""
+
+    plan: _Plans
+    settings: Callable[[str, Mapping[str, Any] | None], Settings]
+    candidates: Sequence[float]
+
+    def __call__(
+        self, demos: Request, env: str, trained: Sequence[Any], method: str, seed: int
+    ) -> Request:
+        airl = self.settings(env, {"airl.method": method}).airl
+        if not self.candidates or method not in PENALISED:
+            return train_airl.request(From(demos), env, trained, airl, seed)
+        choice = choose_penalty.request(From(demos), env, trained, airl, self.candidates, seed)
+        made = self.plan(choice)[-1].artefact
+        if made is not None:
+            value = read_json(self.plan.store.open(made, "choice.json"))
+            weight = msgspec.convert(value, choose_penalty.Choice).chosen
+            airl = msgspec.structs.replace(airl, penalty_weight=weight)
+        basis = {"penalty choice": From(choice, "choice.json")}
+        return train_airl.request(From(demos), env, trained, airl, seed, basis)
+
+    def has_chosen(self, airl: Request) -> bool:
+        """Whether the lambda of ``airl`` is that of a choice that has been made."""
+        basis = airl.inputs.get("penalty choice")
+        return basis is not None and self.plan(basis.request)[-1].artefact is not None
+
+
 def _check(values: Sequence[Any], what: str, known: Sequence[Any] | None = None) -> None:
     if not values:
         raise UsageError(f"no {what} is named", f"name at least one {what}")
@@ -172,7 +205,9 @@ def _check(values: Sequence[Any], what: str, known: Sequence[Any] | None = None)
             )
 
 
-def _row(env, knob, measures, settings, methods, seeds) -> tuple[results.Row, list[_Planned]]:
+def _row(
+    env, knob, measures, settings, methods, seeds, learner
+) -> tuple[results.Row, list[_Planned]]:
     """One row of the table and everything that it stands on."""
     config = settings(env, None)
     listed = config.interventions[knob]
@@ -213,10 +248,12 @@ def _row(env, knob, measures, settings, methods, seeds) -> tuple[results.Row, li
         _Planned(results.Cell(name, "expert", "id", place=str(e)), measured([e], expert(e)), {})
         for e in trained
     ]
+    chosen = {}
     for method in methods:
-        learning = settings(env, {"airl.method": method})
         for seed in seeds:
-            airl = train_airl.request(From(demos), env, trained, learning.airl, seed)
+            airl = learner(demos, env, trained, method, seed)
+            if learner.has_chosen(airl):
+                chosen[f"{method} {seed}"] = airl.parameters.airl.penalty_weight
             moved = transfer.request(From(airl, "reward.pt"), env, unseen[0], config.transfer, seed)
             where = {
                 "transfer": (unseen, moved, {"transfer-learning": moved}),
@@ -235,6 +272,7 @@ def _row(env, knob, measures, settings, methods, seeds) -> tuple[results.Row, li
         unseen=str(unseen[0]),
         demonstrations=demos.parameters.episodes,
         settings={stage: tree[stage] for stage in _STAGES},
+        chosen=chosen,
     )
     return row, planned
 

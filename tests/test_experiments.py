@@ -188,6 +188,29 @@ def test_other_evaluations_are_left_out_too(report, irl, table_store, tmp_path):
     assert left_out.endswith("evaluation.episodes 3 instead of 2.")
 
 
+def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    common = ["--store", copy, "--profile", "smoke", "--quiet", *SMALL]
+    choice = ["--choose-penalty", "1,10"]
+    learn = ["train-airl", "--demos", "demos", "--method", "irm", "--name", "chosen"]
+    made = irl(*learn, *choice, *common)
+    assert made.code == 0, made.err
+    assert irl("evaluate", "--policy", "chosen", "--ood", "1.5x", *common).code == 0
+    done = report("table1", copy, *ROW, *choice, "--json")
+    said = json.loads(done.out)["report"]
+    there = {(p["agent"], p["seed"]) for p in said["points"] if p["measure"] == "zero-shot"}
+    assert there == {("erm", 0), ("erm", 1), ("irm", 0)}
+    (missing,) = (n for n in said["notes"] if n.startswith("Missing: lunar-lander engine-power"))
+    assert "AIRL-IRM 1" in missing
+    (budgets,) = (t for t in said["tables"] if t["title"] == "Budgets")
+    weight = json.loads((copy / made.out.strip().split("/")[-1] / "reward.json").read_text())
+    assert budgets["rows"][1][4] == f"irm 0: {weight['airl']['penalty_weight']:g}"
+    # Without asking for it, the fixed lambda's runs are what the table is made of.
+    fixed = json.loads(report("table1", copy, *ROW, "--json").out)["report"]
+    assert sum(p["agent"] == "irm" and p["measure"] == "zero-shot" for p in fixed["points"]) == 2
+
+
 def test_a_profile_without_runs_is_no_table(report, irl, table_store):
     done = report("table1", table_store, small=[])
     assert done.code == 3

@@ -462,14 +462,17 @@ def _budgets(plan: Plan) -> Table:
                 f"{s['expert']['total_steps']:,}",
                 ", ".join(map(str, row.demonstrations)),
                 f"{s['airl']['total_steps']:,}",
-                f"{s['airl']['penalty_weight']:g}",
+                ", ".join(f"{run}: {weight:g}" for run, weight in row.chosen.items())
+                or f"{s['airl']['penalty_weight']:g}",
+                s["airl"].get("select", "last"),
                 f"{s['transfer']['total_steps']:,}" if "transfer" in plan.measures else "-",
                 str(s["evaluation"]["episodes"]),
             ]
         )
-    columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda"]
+    columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda", "round"]
     note = (
-        "Demonstrations: episodes of each setting trained in. Lambda: the weight of IRM's penalty."
+        "Demonstrations: episodes of each setting trained in. Lambda: the weight of IRM's penalty, by "
+        "method and seed where it was chosen by leaving a setting out. Round: the one kept."
     )
     return Table("Budgets", note, [*columns, "transfer steps", "evaluation episodes"], lines)
 

@@ -41,7 +41,10 @@ class Cell(msgspec.Struct, frozen=True, kw_only=False):
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One environment and knob: the settings, and every setting (in both senses) of its stages."""
+    """One environment and knob: the settings, and every setting (in both senses) of its stages.
+
+    ``chosen`` maps ``METHOD SEED`` to its lambda where that was chosen by leaving a setting out.
+    """
 
     env: str
     knob: str
@@ -49,6 +52,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     unseen: str
     demonstrations: tuple[int, ...]
     settings: dict[str, Any]
+    chosen: dict[str, float] = {}
 
     @property
     def name(self) -> str:
