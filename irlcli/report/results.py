@@ -222,6 +222,9 @@ def _missing(plan: Plan) -> list[str]:
             if not c.run:
                 which = c.place or ("" if c.seed is None else f"{c.seed}")
                 agent = TITLES[c.agent]
+                if c.seed is not None and c.why.startswith("evaluate"):
+                    # A run has several evaluations; any other stage stands for all of them.
+                    agent += f" {c.measure}"
                 reasons.setdefault(c.why, {}).setdefault(agent, {})[which] = None
         parts = [
             f"{why}: "
@@ -251,11 +254,14 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
 
 def _identical(episodes: Episodes) -> list[str]:
     """Runs that cannot be told apart: seeds that are no sample, or a method without effect."""
+    groups: dict[tuple[str, tuple], list[str]] = {}
+    for (row, measure), found in episodes.items():
+        for runs in identical_runs(found):
+            groups.setdefault((row, runs), []).append(measure)
     return [
-        f"Identical: {row}, {measure}: {', '.join(f'{TITLES[a]} seed {s}' for a, s in runs)} have "
-        "the same returns to the bit: between them neither seed nor method made a difference."
-        for (row, measure), found in episodes.items()
-        for runs in identical_runs(found)
+        f"Identical: {row}, {', '.join(measures)}: {', '.join(f'{TITLES[a]} seed {s}' for a, s in runs)} "
+        "have the same returns to the bit: between them neither seed nor method made a difference."
+        for (row, runs), measures in groups.items()
     ]
 
 
