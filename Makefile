@@ -1,7 +1,11 @@
-# Two set-up commands: `make demo` and `make test`. Tables: `make table1-lunar-lander`.
+# Two set-up commands: `make demo` and `make test`. Results: `make table1 figure2 figure3 figure4
+# table2`, or `make all-results`; `make report-table1` reports on what is there and runs nothing.
 #
 #   PROFILE=smoke|standard|paper   budgets (settings/)
 #   SEEDS="0 1 2"                  seeds of the reward learning
+#   METHODS="erm irm"              of erm, irm, erm-balanced, irm-shuffled
+#   SET="--set FIELD=VALUE"        more settings, for every command
+#   CHOOSE="--choose-penalty 1,10" lambda of the penalised methods by leaving a setting out
 #   STORE=DIR                      artefact store
 #   RUN="srun -c2"                 put before every irl command, e.g. to spread over a cluster
 #
@@ -13,16 +17,16 @@ VENV    ?= .venv
 STORE   ?= runs
 PROFILE ?= standard
 SEEDS   ?= 0 1 2 3 4
-METHODS ?= erm erm-balanced irm
+METHODS ?= erm irm erm-balanced irm-shuffled
 RUN     ?=
 
 IRL     := $(VENV)/bin/irl
 NAMES   := $(STORE)/.names
-COMMON   = --store $(STORE) --profile $(PROFILE)
+COMMON   = --store $(STORE) --profile $(PROFILE) $(SET)
 READY   := $(VENV)/.installed
 
 .DELETE_ON_ERROR:
-.PHONY: demo test bench table1-lunar-lander figure2 clean FORCE
+.PHONY: demo test bench all-results table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -45,23 +49,65 @@ bench: $(READY)
 # LunarLander with two engine powers to learn from and a third, unseen one to transfer to.
 # One seed and about half the standard budget: a look at the whole chain, not a comparison.
 DEMO_SETTINGS := --settings settings/demo/lunar-lander.toml
+DEMO_ROW := lunar-lander.engine-power
 demo: $(READY)
 	@$(MAKE) --no-print-directory -j2 TERM=dumb PROFILE=standard SEEDS=0 METHODS="erm irm" \
-	    COMMON="--store $(STORE) $(DEMO_SETTINGS)" TAG=demo row-engine-power
+	    COMMON="--store $(STORE) $(DEMO_SETTINGS)" TAG=demo \
+	    $(DEMO_ROW).returns
 	@echo
-	@$(IRL) report returns --store $(STORE) $(call EVALUATIONS,demo,engine-power,erm irm,0)
+	@$(IRL) report returns --store $(STORE) $(call RETURNS,demo.$(DEMO_ROW),erm irm,0)
 	@echo
-	@echo "lineage of the IRM transfer policy (irl lineage demo.engine-power.irm.0.transfer):"
-	@$(IRL) lineage --store $(STORE) demo.engine-power.irm.0.transfer
+	@echo "lineage of the IRM transfer policy (irl lineage demo.$(DEMO_ROW).irm.0.transfer):"
+	@$(IRL) lineage --store $(STORE) demo.$(DEMO_ROW).irm.0.transfer
 
-table1-lunar-lander: row-bounce row-engine-power
-	$(IRL) report returns --store $(STORE) \
-	    $(call EVALUATIONS,$(TAG),bounce,$(METHODS),$(SEEDS)) \
-	    $(call EVALUATIONS,$(TAG),engine-power,$(METHODS),$(SEEDS))
+# The paper's tables and figures: rows of ENV.KNOB, whose settings stand in settings/ENV.toml.
+TABLE1  := lunar-lander.bounce lunar-lander.engine-power ant.friction ant.leg-length
+FIGURE3 := ant.leg-length half-cheetah.friction reacher.gravity
+FIGURE4 := ant.goal-y half-cheetah.goal-y
+
+all-results: table1 figure2 figure3 figure4 table2
+
+table1: $(addsuffix .returns,$(TABLE1)) $(addsuffix .id-returns,$(TABLE1))
+	$(REPORT)
+table1-lunar-lander: $(foreach row,$(filter lunar-lander.%,$(TABLE1)),$(row).returns $(row).id-returns)
+	$(REPORT)
+figure3: $(addsuffix .zero-shot-returns,$(FIGURE3)) $(addsuffix .id-returns,$(FIGURE3))
+	$(REPORT)
+figure4: $(addsuffix .zero-shot-returns,$(FIGURE4)) $(addsuffix .id-returns,$(FIGURE4))
+	$(REPORT)
+
+# What is there, without running anything.
+REPORTS := $(addprefix report-,table1 table1-lunar-lander figure3 figure4)
+.PHONY: $(REPORTS)
+$(REPORTS): $(READY)
+	$(REPORT)
+
+# Of the target's name: the report (what follows a dash is an environment), and where its files go.
+WHAT    = $(patsubst report-%,%,$@)
+KIND    = $(firstword $(subst -, ,$(WHAT)))
+ENV     = $(patsubst $(KIND)-%,--env %,$(filter $(KIND)-%,$(WHAT)))
+COMMA  := ,
+SPACE  := $(subst ,, )
+LIST    = $(subst $(SPACE),$(COMMA),$(strip $(1)))
+RESULTS ?= docs/results/$(WHAT)
+
+define REPORT
+@mkdir -p $(RESULTS)
+made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(CHOOSE) $(ENV) --seeds $(call LIST,$(SEEDS)) \
+    --methods $(call LIST,$(METHODS)) --name $(TAG).$(WHAT)) && \
+  install -m 644 $$made/README.md $$made/$(KIND).* $$made/seeds.csv $$made/comparisons.csv $(RESULTS)
+endef
+
+table2: $(READY)
+	@mkdir -p $(RESULTS)
+	$(IRL) report table2 --format latex > $(RESULTS)/table2.tex
+	{ echo '# Table 2: interventional settings'; echo; \
+	  echo 'The values of `settings/*.toml`, by `irl report table2 --format markdown`. ID: trained'; \
+	  echo 'in; OOD: held out.'; echo; \
+	  $(IRL) report table2 --format markdown; } > $(RESULTS)/README.md
 
 # Every method on 20 gridworld datasets: the picture, the table, and how they came about.
 # SET="--set gridworld.goal=terminal" and the like make other cases, RESULTS says where they go.
-RESULTS ?= docs/results/figure2
 FIGURE2   = $(strip report figure2 --profile $(PROFILE) $(SET))
 MADE_AT   = import json, sys; a = json.load(sys.stdin); print(a["path"], a["provenance"]["git"]["commit"])
 figure2: $(READY)
@@ -75,49 +121,62 @@ figure2: $(READY)
 	    echo 'three settings trained on, in each dataset.'; echo; \
 	    cat $$1/figure2.md; } > $(RESULTS)/README.md
 
-# A row of the table: experts -> demonstrations -> AIRL per method and seed -> transfer -> returns.
-# The held-out values stand in settings/lunar-lander.toml.
-TAG ?= $(PROFILE)
-RUNS         = $(foreach m,$(3),$(foreach s,$(4),$(1).$(2).$(m).$(s)))
-EVALUATIONS  = $(1).$(2).expert-returns $(1).$(2).random-returns $(1).$(2).idle-returns \
-               $(addsuffix .zero-shot-returns,$(call RUNS,$(1),$(2),$(3),$(4))) \
-               $(addsuffix .transfer-returns,$(call RUNS,$(1),$(2),$(3),$(4)))
+# A row: experts -> demonstrations -> AIRL per method and seed -> transfer -> returns. Its targets
+# are names in the store; ROW.returns and the like are those of a row together.
+TAG    ?= $(PROFILE)
+RUNS    = $(foreach m,$(2),$(foreach s,$(3),$(1).$(m).$(s)))
+AGENTS  = $(addprefix $(1),.expert-returns .random-returns .idle-returns)
+ZERO    = $(call AGENTS,$(1)) $(addsuffix .zero-shot-returns,$(call RUNS,$(1),$(2),$(3)))
+RETURNS = $(call ZERO,$(1),$(2),$(3)) $(addsuffix .transfer-returns,$(call RUNS,$(1),$(2),$(3)))
+CELLS   = $(addprefix $(NAMES)/,$(call $(1),$(TAG).$(2),$(METHODS),$(SEEDS)))
 
+# $(1) ENV.KNOB, $(2) ENV, $(3) KNOB
 define ROW
-.PHONY: row-$(1)
-row-$(1): $$(addprefix $(NAMES)/,$$(call EVALUATIONS,$(TAG),$(1),$(METHODS),$(SEEDS)))
+.PHONY: $(1).returns $(1).zero-shot-returns $(1).id-returns $(1).expert-id-returns
+$(1).returns: $$(call CELLS,RETURNS,$(1))
+$(1).zero-shot-returns: $$(call CELLS,ZERO,$(1))
+$(1).id-returns: $(1).expert-id-returns $$(addsuffix .id-returns,$$(call CELLS,RUNS,$(1)))
 
 $(NAMES)/$(TAG).$(1).demos: $(READY) FORCE
-	$$(RUN) $(IRL) collect-experts --env lunar-lander --intervention $(1) $$(COMMON) --name $$(@F)
+	$$(RUN) $(IRL) collect-experts --env $(2) --intervention $(3) $$(COMMON) --name $$(@F)
 
 $(NAMES)/$(TAG).$(1).expert-returns: $(READY) FORCE
-	$$(RUN) $(IRL) evaluate --expert --env lunar-lander --ood $(1) $$(COMMON) --name $$(@F)
+	$$(RUN) $(IRL) evaluate --expert --env $(2) --ood $(3) $$(COMMON) --name $$(@F)
 
 $(NAMES)/$(TAG).$(1).random-returns: $(READY) FORCE
-	$$(RUN) $(IRL) evaluate --random --env lunar-lander --ood $(1) $$(COMMON) --name $$(@F)
+	$$(RUN) $(IRL) evaluate --random --env $(2) --ood $(3) $$(COMMON) --name $$(@F)
 
 $(NAMES)/$(TAG).$(1).idle-returns: $(READY) FORCE
-	$$(RUN) $(IRL) evaluate --idle --env lunar-lander --ood $(1) $$(COMMON) --name $$(@F)
+	$$(RUN) $(IRL) evaluate --idle --env $(2) --ood $(3) $$(COMMON) --name $$(@F)
 
-$$(foreach m,$(METHODS),$$(foreach s,$(SEEDS),$$(eval $$(call CELL,$(1),$$(m),$$(s)))))
+# An evaluation for each setting, too many for one name. The report's name keeps them from gc.
+$(1).expert-id-returns: $(NAMES)/$(TAG).$(1).demos
+	$$(RUN) $(IRL) evaluate --expert --env $(2) --intervention $(3) $$(COMMON)
+
+$$(foreach m,$(METHODS),$$(foreach s,$(SEEDS),$$(eval $$(call CELL,$(TAG).$(1).$$(m).$$(s),$(TAG).$(1),$(3),$$(m),$$(s)))))
 endef
 
-# $(1) intervention, $(2) method, $(3) seed
+# $(1) name, $(2) name of the row, $(3) KNOB, $(4) method, $(5) seed
 define CELL
-$(NAMES)/$(TAG).$(1).$(2).$(3): $(NAMES)/$(TAG).$(1).demos FORCE
-	$$(RUN) $(IRL) train-airl --demos $$(<F) --method $(2) --seed $(3) $$(COMMON) --name $$(@F)
+$(NAMES)/$(1): $(NAMES)/$(2).demos FORCE
+	$$(RUN) $(IRL) train-airl --demos $$(<F) --method $(4) --seed $(5) $(if $(filter irm%,$(4)),$$(CHOOSE)) \
+	    $$(COMMON) --name $$(@F)
 
-$(NAMES)/$(TAG).$(1).$(2).$(3).zero-shot-returns: $(NAMES)/$(TAG).$(1).$(2).$(3) FORCE
-	$$(RUN) $(IRL) evaluate --policy $$(<F) --ood $(1) $$(COMMON) --name $$(@F)
+$(NAMES)/$(1).zero-shot-returns: $(NAMES)/$(1) FORCE
+	$$(RUN) $(IRL) evaluate --policy $$(<F) --ood $(3) $$(COMMON) --name $$(@F)
 
-$(NAMES)/$(TAG).$(1).$(2).$(3).transfer: $(NAMES)/$(TAG).$(1).$(2).$(3) FORCE
-	$$(RUN) $(IRL) transfer --reward $$(<F) --ood $(1) --seed $(3) $$(COMMON) --name $$(@F)
+$(NAMES)/$(1).id-returns: $(NAMES)/$(1) FORCE
+	$$(RUN) $(IRL) evaluate --policy $$(<F) --intervention $(3) $$(COMMON) --name $$(@F)
 
-$(NAMES)/$(TAG).$(1).$(2).$(3).transfer-returns: $(NAMES)/$(TAG).$(1).$(2).$(3).transfer FORCE
+$(NAMES)/$(1).transfer: $(NAMES)/$(1) FORCE
+	$$(RUN) $(IRL) transfer --reward $$(<F) --ood $(3) --seed $(5) $$(COMMON) --name $$(@F)
+
+$(NAMES)/$(1).transfer-returns: $(NAMES)/$(1).transfer FORCE
 	$$(RUN) $(IRL) evaluate --policy $$(<F) $$(COMMON) --name $$(@F)
 endef
 
-$(foreach row,bounce engine-power,$(eval $(call ROW,$(row))))
+$(foreach row,$(sort $(TABLE1) $(FIGURE3) $(FIGURE4)),$(eval \
+    $(call ROW,$(row),$(firstword $(subst ., ,$(row))),$(lastword $(subst ., ,$(row))))))
 
 FORCE:
 

@@ -12,6 +12,7 @@ import typer
 from irlcli import console as out
 from irlcli.errors import IntegrityError, Interrupted, IrlError, NotFound, StageFailed, UsageError
 
+_REPORTS = "returns, table1, figure2, figure3, figure4, table2"
 _COMMANDS: dict[str, tuple[Callable, bool]] = {}
 
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
@@ -40,9 +41,9 @@ class Session:
 
         self.store = Store(store)
         self.as_json = as_json
-        self._profile = profile
-        self._settings = settings
-        self._overrides = list(overrides)
+        self.profile = profile
+        self.settings_file = settings
+        self.overrides = list(overrides)
         self._dry_run = dry_run
         self._wait = wait
         self._workers = workers
@@ -52,10 +53,15 @@ class Session:
         """Settings of ``env`` under this session's options."""
         from irlcli.settings import load_settings
 
-        return load_settings(env, self._profile, self._settings, self._overrides, flags)
+        return load_settings(env, self.profile, self.settings_file, self.overrides, flags)
 
-    def deliver(self, requests: Sequence[Any], name: str | None = None) -> list[Any]:
-        """Run requests (or plan them, with --dry-run) and print one line for each."""
+    def deliver(
+        self, requests: Sequence[Any], name: str | None = None, table: str | None = None
+    ) -> list[Any]:
+        """Run requests (or plan them, with --dry-run) and print one line for each.
+
+        With --json, ``table`` is the JSON output that is printed with the artefact.
+        """
         if name is not None:
             # Before the work, not after it.
             self.store.check_name(name)
@@ -82,11 +88,17 @@ class Session:
                         "stage": record.stage,
                         "name": name,
                         "outputs": [o.path for o in artefact.manifest.outputs],
+                        **({} if table is None else {"report": self._read(artefact, table)}),
                     },
                 )
             else:
                 out.print_data(str(artefact.directory))
         return artefacts
+
+    def _read(self, artefact: Any, output: str) -> Any:
+        from irlcli.store import read_json
+
+        return read_json(self.store.open(artefact, output))
 
     def prepare(self, request: Any, then: str) -> Any | None:
         """The artefact of ``request``, unprinted; with --dry-run, None if ``then`` has to wait."""
@@ -185,7 +197,8 @@ def collect_experts(
         str, typer.Option(help="KNOB=VALUE,VALUE; KNOB alone takes its ID values from settings/.")
     ],
     episodes: Annotated[
-        str | None, typer.Option(help="Per setting: 10, or 1,3,10 for three settings.")
+        str | None,
+        typer.Option(help="Per setting: 10, or 1,3,10 for three. By default those of settings/."),
     ] = None,
     seed: Seed = 0,
     name: Name = None,
@@ -195,7 +208,11 @@ def collect_experts(
 
     config = session.settings(env)
     settings = _settings(env, config, intervention, "id")
-    counts = None if episodes is None else _counts(episodes)
+    listed = config.interventions.get(intervention)
+    if episodes is not None:
+        counts = _counts(episodes)
+    else:
+        counts = listed.episodes if listed is not None else ()
     request = collect_experts.request(env, settings, config, seed, counts)
     for artefact in session.deliver([request], name):
         _warn_of_missed_bars(session, artefact, config.expert.bar)
@@ -716,11 +733,38 @@ def name(
 @command("report")
 def report(
     session: Session,
-    kind: Annotated[str, typer.Argument(help="returns or figure2.")],
+    kind: Annotated[str, typer.Argument(help=_REPORTS)],
     refs: Annotated[list[str] | None, typer.Argument(help="Evaluations, for returns.")] = None,
+    seeds: Annotated[
+        str | None, typer.Option(help="Of the reward learning; 0,1,2,3,4 by default.")
+    ] = None,
+    methods: Annotated[
+        str | None, typer.Option(help="erm,irm,erm-balanced,irm-shuffled by default.")
+    ] = None,
+    env: Annotated[str | None, typer.Option(help="Only this environment's rows.")] = None,
+    choose_penalty: Annotated[
+        str | None, typer.Option(help="Candidates for lambda that train-airl chose from.")
+    ] = None,
+    form: Annotated[
+        str | None, typer.Option("--format", help="Of table2: text, markdown or latex.")
+    ] = None,
     name: Name = None,
 ) -> None:
-    """Put results side by side: ``irl report returns REF...``, ``irl report figure2``."""
+    """Put results side by side: ``irl report returns REF...``, ``irl report table1``."""
+    if kind not in _REPORTS.split(", "):
+        raise UsageError(f"unknown report {kind!r}", f"known: {_REPORTS}")
+    compared = {
+        "--seeds": seeds,
+        "--methods": methods,
+        "--env": env,
+        "--choose-penalty": choose_penalty,
+    }
+    if kind in ("returns", "figure2", "table2"):
+        _refuse(kind, {**compared, "--format": form if kind != "table2" else None})
+    else:
+        _refuse(kind, {"--format": form})
+    if kind != "returns" and refs:
+        raise UsageError(f"{kind} takes no references", "its runs are found by their settings")
     if kind == "returns":
         if not refs:
             raise UsageError(
@@ -728,11 +772,103 @@ def report(
             )
         _print_returns(session, refs)
     elif kind == "figure2":
-        if refs:
-            raise UsageError("figure2 takes no references", "its seeds are --set figure2.seeds=20")
         _report_figure2(session, name)
+    elif kind == "table2":
+        _print_table2(session, form or "text")
     else:
-        raise UsageError(f"unknown report {kind!r}", "known: returns, figure2")
+        _report_experiment(session, kind, methods, seeds, env, choose_penalty, name)
+
+
+def _refuse(kind: str, options: dict[str, Any]) -> None:
+    for option, value in options.items():
+        if value is not None:
+            raise UsageError(f"{kind} takes no {option}", "`irl report --help` says what it is of")
+
+
+def _report_experiment(
+    session: Session,
+    kind: str,
+    methods: str | None,
+    seeds: str | None,
+    env: str | None,
+    choose_penalty: str | None,
+    name: str | None,
+) -> None:
+    import shlex
+
+    from irlcli import experiments
+    from irlcli.runner import Runner
+    from irlcli.store import read_json
+
+    chosen = experiments.METHODS if methods is None else tuple(methods.split(","))
+    try:
+        numbers = tuple(int(seed) for seed in (seeds or "0,1,2,3,4").split(","))
+    except ValueError:
+        raise UsageError(f"--seeds {seeds!r} is no list of seeds", "write 0,1,2,3,4") from None
+    if min(numbers) < 0:
+        raise UsageError(f"--seeds {seeds!r}: no seed -1 or below", "seeds are 0 or more")
+    words = ["irl", "report", kind, "--profile", session.profile]
+    words += [] if session.settings_file is None else ["--settings", str(session.settings_file)]
+    words += [word for item in session.overrides for word in ("--set", item)]
+    words += ["--seeds", ",".join(map(str, numbers)), "--methods", ",".join(chosen)]
+    words += [] if env is None else ["--env", env]
+    candidates: Sequence[float] = ()
+    if choose_penalty is not None:
+        words += ["--choose-penalty", choose_penalty]
+        candidates = _numbers("--choose-penalty", choose_penalty)
+    request = experiments.request(
+        kind,
+        Runner(session.store),
+        session.settings,
+        chosen,
+        numbers,
+        shlex.join(words),
+        env,
+        candidates,
+    )
+    for artefact in session.deliver([request], name, table=f"{kind}.json"):
+        if not session.as_json:
+            _print_report(read_json(session.store.open(artefact, f"{kind}.json")))
+
+
+def _print_report(report: dict[str, Any]) -> None:
+    for table in report["tables"]:
+        if table["title"] != "Every cell":
+            out.print_table(table["columns"], table["rows"], table["title"], stderr=True)
+            print(f"{table['note']}\n" if table["note"] else "", file=sys.stderr)
+    for note in report["notes"]:
+        print(f"- {note}", file=sys.stderr)
+
+
+def _print_table2(session: Session, form: str) -> None:
+    """Paper Table 2, from the settings files."""
+    from irlcli.interventions import ENVIRONMENTS
+    from irlcli.report.tables import latex_table, markdown_table
+
+    forms = ("text", "markdown", "latex")
+    if form not in forms:
+        raise UsageError(f"unknown --format {form!r}", f"known: {', '.join(forms)}")
+    listed = [
+        (env, knob, values)
+        for env, environment in ENVIRONMENTS.items()
+        if not environment.tabular
+        for knob, values in session.settings(env).interventions.items()
+    ]
+    if session.as_json:
+        items = [
+            {"env": env, "knob": knob, "id": list(values.id), "ood": list(values.ood)}
+            for env, knob, values in listed
+        ]
+        out.print_json("table2", {"rows": items})
+        return
+    columns = ["environment", "intervention", "values (ID)", "values (OOD)"]
+    rows = [[env, knob, ", ".join(v.id), ", ".join(v.ood)] for env, knob, v in listed]
+    if form == "markdown":
+        out.print_data(markdown_table(columns, rows).rstrip())
+    elif form == "latex":
+        out.print_data(latex_table(columns, rows, "Interventional settings").rstrip())
+    else:
+        out.print_table(columns, rows)
 
 
 def _report_figure2(session: Session, name: str | None) -> None:

@@ -72,10 +72,14 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class InterventionSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Paper Table 2: the values trained on and the held-out ones."""
+    """Paper Table 2: the values trained on and the held-out ones.
+
+    ``episodes`` are the demonstrations of each value trained on, where they differ.
+    """
 
     id: tuple[str, ...]
     ood: tuple[str, ...]
+    episodes: tuple[Count, ...] = ()
 
 
 class ExpertSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

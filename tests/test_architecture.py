@@ -45,6 +45,7 @@ NEVER = {
     "report": {"torch", "stable_baselines3", "cli", "stages", "runner"},
     "stages": {"cli", "console", "runner", "stable_baselines3"},
     "runner": {"cli", "console"} | HEAVY,
+    "experiments": {"cli", "console", "report"} | HEAVY,
 }
 # Modules that planning and hits load: nothing heavy at their top level.
 LIGHT = [
@@ -56,7 +57,9 @@ LIGHT = [
     "interventions",
     "runner",
     "references",
+    "experiments",
     "report/returns",
+    "report/tables",
     "stages/__init__",
     "stages/train_expert",
     "stages/collect_experts",
@@ -65,6 +68,7 @@ LIGHT = [
     "stages/train_maxent",
     "stages/sweep_maxent",
     "stages/figure2",
+    "stages/results",
     "stages/transfer",
     "stages/evaluate",
 ]

@@ -20,6 +20,8 @@ import pandas as pd
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
+from irlcli.report.statistics import bootstrap_interval
+
 MEASURES = (
     "goal_probability",
     "true_return",
@@ -27,17 +29,8 @@ MEASURES = (
     "rank_correlation",
     "log_likelihood",
 )
-_RESAMPLES = 10_000
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 GROUP_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
-
-
-def bootstrap_interval(sample: np.ndarray, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile interval of the mean of ``sample`` [n]."""
-    rng = np.random.default_rng(seed)
-    means = sample[rng.integers(len(sample), size=(_RESAMPLES, len(sample)))].mean(1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
 
 
 def summary(quality: pd.DataFrame) -> pd.DataFrame:
@@ -104,12 +97,6 @@ def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:
     }
     erm = rows[rows["method"] == "erm"]
     return {**found, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
-
-
-def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ def run(job: Job) -> None:
     from irlcli import tabular
     from irlcli.envs.gridworld import walls
     from irlcli.interventions import env_kwargs, parse_setting
-    from irlcli.report import figure2
+    from irlcli.report import figure2, tables
     from irlcli.stages import gridworlds
 
     p: Parameters = job.parameters
@@ -93,7 +93,7 @@ def run(job: Job) -> None:
     maze = figure2.Maze(grid.size, paths, wall(p.settings), wall(p.unseen))
     figure2.draw(job.output, maze, panels, found, figure2.curves(quality), p.seed)
     found.to_csv(job.output / "figure2.csv", index=False, float_format="%.6g", lineterminator="\n")
-    text = figure2.markdown(*figure2.table(found, p.unseen))
+    text = tables.markdown_table(*figure2.table(found, p.unseen))
     (job.output / "figure2.md").write_text(text)
 
 

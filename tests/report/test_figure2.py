@@ -2,9 +2,9 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 
-from irlcli.report.figure2 import MEASURES, bootstrap_interval, curves, markdown, summary, table
+from irlcli.report.figure2 import MEASURES, curves, summary, table
+from irlcli.report.tables import markdown_table
 
 
 def quality(variant, setting, seen, values, **more):
@@ -15,15 +15,6 @@ def quality(variant, setting, seen, values, **more):
         | {"seen": seen, **dict.fromkeys(MEASURES, value)}
         for seed, value in enumerate(values)
     ]
-
-
-def test_interval_is_that_of_a_normal_mean():
-    sample = np.random.default_rng(1).normal(3.0, 2.0, 400)
-    low, high = bootstrap_interval(sample)
-    error = 1.96 * sample.std() / 20
-    assert low == pytest.approx(sample.mean() - error, abs=0.02)
-    assert high == pytest.approx(sample.mean() + error, abs=0.02)
-    assert bootstrap_interval(np.full(5, 7.0)) == (7.0, 7.0)
 
 
 def test_worst_is_taken_within_each_dataset_and_among_trained_settings():
@@ -47,7 +38,7 @@ def test_table_has_a_row_a_variant():
     columns, body = table(summary(pd.DataFrame(rows)), ["c"])
     assert columns[:3] == ["method", "goal probability, worst trained", "goal probability, c"]
     assert body[0][:3] == ["erm", "1.00 [1.00, 1.00]", "0.25 [0.25, 0.25]"]
-    assert markdown(columns[:2], [r[:2] for r in body]).splitlines() == [
+    assert markdown_table(columns[:2], [r[:2] for r in body]).splitlines() == [
         "| method | goal probability, worst trained |",
         "| --- | --- |",
         "| erm | 1.00 [1.00, 1.00] |",

@@ -1,0 +1,539 @@
+"""What evaluations say: a number per cell, comparisons over seeds, and every reservation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import pandas as pd
+
+from irlcli.report import paper
+from irlcli.report.statistics import compare, holm, identical_runs, summarise
+
+TITLES = {
+    "erm": "AIRL-ERM",
+    "irm": "AIRL-IRM",
+    "erm-balanced": "ERM-balanced",
+    "irm-shuffled": "IRM, labels shuffled",
+    "expert": "expert",
+    "random": "random",
+    "idle": "idle",
+}
+MEASURES = {
+    "transfer": "Transfer: a new policy on the frozen reward, in the unseen setting",
+    "zero-shot": "Zero-shot: the student, in the unseen setting",
+    "id": "In distribution: the student, mean over the settings trained in",
+}
+BASELINES = ("expert", "random", "idle")
+# The comparison the paper makes first, then those with the controls.
+_PAIRS = (("irm", "erm"), ("irm", "erm-balanced"), ("irm", "irm-shuffled"))
+IMITATED = 0.8
+
+
+class Plan(Protocol):
+    """What a report is about: ``stages.results.Parameters``."""
+
+    kind: str
+    title: str
+    command: str
+    measures: tuple[str, ...]
+    rows: tuple[Any, ...]
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    cells: tuple[Any, ...]
+    runs: dict[str, Any]
+    libraries: dict[str, dict[str, str | None]]
+    others: tuple[Any, ...]
+
+
+class Table(NamedTuple):
+    """Text in columns, the first ``heads`` of which name the row."""
+
+    title: str
+    note: str
+    columns: list[str]
+    rows: list[list[str]]
+    heads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Everything that is said, before it is laid out.
+
+    Attributes:
+        points: a row per evaluation and setting: ``row``, ``agent``, ``measure``, ``seed``,
+            ``setting``, ``true_return``, ``progress``, ``episodes``, ``evaluation`` (its id).
+        cells: a row per row, agent and measure.
+        comparisons: a row per row, measure and pair of methods.
+        tables: the same for people.
+        notes: what must be known before the numbers are believed.
+    """
+
+    points: pd.DataFrame
+    cells: pd.DataFrame
+    comparisons: pd.DataFrame
+    tables: list[Table]
+    notes: list[str]
+
+
+Episodes = Mapping[tuple[str, str], Mapping[tuple[str, int], np.ndarray]]
+
+
+def build(plan: Plan, points: pd.DataFrame, episodes: Episodes) -> Report:
+    """The report on ``points``: a row per evaluation and setting, as in :class:`Report`.
+
+    ``episodes`` are the true returns by (row, measure), then (method, seed).
+    """
+    cells = _cells(plan, points)
+    comparisons = _comparisons(plan, points, cells)
+    notes = [
+        *_missing(plan),
+        *_not_imitated(cells),
+        *_identical(episodes),
+        *_without_p(comparisons),
+        *_left_out(plan),
+        *_mixed(plan),
+    ]
+    tables = [_main_table(plan, m, cells, comparisons) for m in plan.measures]
+    tables += [_comparison_table(comparisons), _cell_table(cells), _budgets(plan), _costs(plan)]
+    return Report(points, cells, comparisons, [t for t in tables if t.rows], notes)
+
+
+def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
+    """``true_return`` and ``progress`` of each seed, means over settings."""
+    chosen = points[
+        (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
+    ]
+    by_seed = chosen.groupby("seed", dropna=False, sort=True)
+    return by_seed[["true_return", "progress"]].mean()
+
+
+def imitates(student: float | None, expert: float | None) -> bool | None:
+    """Whether a student comes within a fifth of its expert's true return; None if unknown.
+
+    For a positive return that is the 80 % rule; a ratio of negative returns would say the reverse.
+    """
+    if student is None or expert is None:
+        return None
+    return student >= expert - (1 - IMITATED) * abs(expert)
+
+
+def _failed(cell: Any) -> bool:
+    return cell.imitated is not pd.NA and not cell.imitated
+
+
+def _cells(plan: Plan, points: pd.DataFrame) -> pd.DataFrame:
+    found = []
+    for row in plan.rows:
+        wanted = [(agent, "ood") for agent in BASELINES]
+        if "id" in plan.measures:
+            wanted.append(("expert", "id"))
+        wanted += [(method, m) for m in plan.measures for method in plan.methods]
+        for agent, measure in wanted:
+            values = sample(points, row.name, agent, measure)
+            s = summarise(values["true_return"].tolist())
+            low, high = s.interval or (None, None)
+            progress = values["progress"].mean() if len(values) else math.nan
+            planned = [
+                c for c in plan.cells if (c.row, c.agent, c.measure) == (row.name, agent, measure)
+            ]
+            found.append(
+                {
+                    "row": row.name,
+                    "agent": agent,
+                    "measure": measure,
+                    "setting": ", ".join(row.trained) if measure == "id" else row.unseen,
+                    "seeds": s.n,
+                    "seeds_wanted": len(plan.seeds) if agent in plan.methods else 1,
+                    "mean": s.mean,
+                    "deviation": s.deviation,
+                    "low": low,
+                    "high": high,
+                    "iqm": s.iqm,
+                    "progress": None if math.isnan(progress) else float(progress),
+                    "complete": all(c.run for c in planned),
+                    "mixed": len(_origins(plan, (c.run for c in planned if c.run))) > 1,
+                }
+            )
+    table = pd.DataFrame(found)
+    experts = table[(table["agent"] == "expert") & (table["measure"] == "id") & table["complete"]]
+    experts = experts.set_index("row")["mean"].to_dict()
+    students = table["agent"].isin(plan.methods) & (table["measure"] == "id")
+    of_expert, imitated = [], []
+    for r, is_student in zip(table.itertuples(), students, strict=True):
+        expert, mean = experts.get(r.row), None if pd.isna(r.mean) else r.mean
+        known = is_student and expert is not None and mean is not None
+        of_expert.append(mean / expert if known and expert > 0 else None)
+        imitated.append(imitates(mean, expert) if known else None)
+    return table.assign(
+        of_expert=pd.array(of_expert, "Float64"), imitated=pd.array(imitated, "boolean")
+    )
+
+
+def _comparisons(plan: Plan, points: pd.DataFrame, cells: pd.DataFrame) -> pd.DataFrame:
+    students = cells[(cells["measure"] == "id") & cells["agent"].isin(plan.methods)]
+    failed = {(r.row, r.agent) for r in students.itertuples() if _failed(r)}
+    found = []
+    for measure in plan.measures:
+        for x, y in _PAIRS:
+            if x not in plan.methods or y not in plan.methods:
+                continue
+            tested = [
+                compare(
+                    sample(points, row.name, x, measure)["true_return"].tolist(),
+                    sample(points, row.name, y, measure)["true_return"].tolist(),
+                )
+                for row in plan.rows
+            ]
+            adjusted = holm([c.welch for c in tested])
+            for row, c, p in zip(plan.rows, tested, adjusted, strict=True):
+                found.append(
+                    {
+                        "row": row.name,
+                        "measure": measure,
+                        "x": x,
+                        "y": y,
+                        "difference": c.difference,
+                        "p_welch": c.welch,
+                        "p_welch_holm": p,
+                        "p_student": c.student,
+                        "improvement": c.improvement,
+                        "not_imitated": " ".join(a for a in (x, y) if (row.name, a) in failed),
+                        "why": c.why,
+                    }
+                )
+    columns = ["row", "measure", "x", "y", "difference", "p_welch", "p_welch_holm", "p_student"]
+    return pd.DataFrame(found, columns=[*columns, "improvement", "not_imitated", "why"])
+
+
+# Reservations
+
+
+def _missing(plan: Plan) -> list[str]:
+    """A note per row: what it waits for, and for whom."""
+    notes = []
+    for row in plan.rows:
+        cells = [c for c in plan.cells if c.row == row.name]
+        reasons: dict[str, dict[str, dict[str, None]]] = {}
+        for c in cells:
+            if not c.run:
+                which = c.place or ("" if c.seed is None else f"{c.seed}")
+                agent = TITLES[c.agent]
+                if c.seed is not None and c.why.startswith("evaluate"):
+                    # A run has several evaluations; any other stage stands for all of them.
+                    agent += f" {c.measure}"
+                reasons.setdefault(c.why, {}).setdefault(agent, {})[which] = None
+        parts = [
+            f"{why}: "
+            + "; ".join(f"{agent} {', '.join(which)}".strip() for agent, which in agents.items())
+            for why, agents in reasons.items()
+        ]
+        if parts:
+            there = sum(1 for c in cells if c.run)
+            notes.append(
+                f"Missing: {row.name}: {there} of {len(cells)} evaluations are there. "
+                f"{'. '.join(parts)}."
+            )
+    return notes
+
+
+def _not_imitated(cells: pd.DataFrame) -> list[str]:
+    notes = []
+    for r in cells.itertuples():
+        if _failed(r):
+            share = "" if r.of_expert is pd.NA else f" ({r.of_expert:.0%} of the expert's return)"
+            notes.append(
+                f"Not imitated: {r.row}, {TITLES[r.agent]}: in distribution the student stays below "
+                f"{IMITATED:.0%} of the expert{share}; a gap to another method is noise."
+            )
+    return notes
+
+
+def _identical(episodes: Episodes) -> list[str]:
+    """Runs that cannot be told apart: seeds that are no sample, or a method without effect."""
+    groups: dict[tuple[str, tuple], list[str]] = {}
+    for (row, measure), found in episodes.items():
+        for runs in identical_runs(found):
+            groups.setdefault((row, runs), []).append(measure)
+    return [
+        f"Identical: {row}, {', '.join(measures)}: {', '.join(f'{TITLES[a]} seed {s}' for a, s in runs)} "
+        "have the same returns to the bit: between them neither seed nor method made a difference."
+        for (row, runs), measures in groups.items()
+    ]
+
+
+def _without_p(comparisons: pd.DataFrame) -> list[str]:
+    """A note per row and reason; the table of comparisons says which."""
+    counts = comparisons[comparisons["why"] != ""].groupby(["row", "why"], sort=False).size()
+    total = comparisons.groupby("row", sort=False).size()
+    return [
+        f"No p-value: {row}: {n} of {total[row]} comparisons: {why}."
+        for (row, why), n in counts.items()
+    ]
+
+
+def _runs(count: int) -> str:
+    return f"{count} run" if count == 1 else f"{count} runs"
+
+
+def _left_out(plan: Plan) -> list[str]:
+    return [
+        f"Left out: {_runs(len(o.ids))} of {o.stage}, {o.about} ({', '.join(o.ids)}): {o.why}."
+        for o in plan.others
+    ]
+
+
+def _mixed(plan: Plan) -> list[str]:
+    notes = []
+    for row in plan.rows:
+        origins = _origins(plan, (c.run for c in plan.cells if c.row == row.name and c.run))
+        if len(origins) > 1:
+            parts = [
+                f"commit {(commit or 'unknown')[:10]}{' with changes ' + dirty if dirty else ''}, "
+                f"libraries {libraries}: {_runs(len(ids))}"
+                for (commit, dirty, libraries), ids in origins.items()
+            ]
+            notes.append(
+                f"Mixed: {row.name}: its runs differ in the code or the libraries they were made "
+                f"with: {'; '.join(parts)}."
+            )
+    return notes
+
+
+def lineage(plan: Plan, ids: Iterable[str]) -> list[str]:
+    """``ids`` and everything that they were made from, each once, depth first."""
+    found: dict[str, None] = {}
+    pending = list(ids)[::-1]
+    while pending:
+        id16 = pending.pop()
+        if id16 in plan.runs and id16 not in found:
+            found[id16] = None
+            pending += reversed(plan.runs[id16].inputs)
+    return list(found)
+
+
+def _origins(plan: Plan, ids: Iterable[str]) -> dict[tuple, list[str]]:
+    """Runs behind ``ids`` by (commit, digest of changes, libraries), the largest group first."""
+    groups: dict[tuple, list[str]] = {}
+    for id16 in lineage(plan, ids):
+        run = plan.runs[id16]
+        groups.setdefault((run.commit, run.dirty, run.libraries), []).append(id16)
+    return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+
+
+# Tables for people
+
+
+def _number(value: Any, digits: int = 1) -> str:
+    return "-" if value is None or pd.isna(value) else f"{value:.{digits}f}"
+
+
+def p_text(value: Any) -> str:
+    """A p-value to three digits, or ``-``."""
+    return "-" if value is None or pd.isna(value) else "< .001" if value < 1e-3 else f"{value:.3f}"
+
+
+def _cell_text(cell: Any) -> str:
+    if pd.isna(cell.mean):
+        return "-"
+    text = f"{cell.mean:.1f}"
+    if not pd.isna(cell.deviation):
+        text += f" ± {cell.deviation:.1f}"
+    if cell.seeds < cell.seeds_wanted:
+        text += f" ({cell.seeds}/{cell.seeds_wanted})"
+    elif not cell.complete:
+        text += " (part)"
+    if _failed(cell):
+        text += " †"
+    return text + (" ‡" if cell.mixed else "")
+
+
+def _main_table(plan: Plan, measure: str, cells: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
+    """A line per row, one more for its progress, and one for the paper's numbers."""
+    baseline = "id" if measure == "id" else "ood"
+    agents = [*plan.methods, "expert"] + ([] if measure == "id" else ["random", "idle"])
+    first = comparisons[(comparisons["x"] == "irm") & (comparisons["y"] == "erm")]
+    tested = {r.row: r for r in first[first["measure"] == measure].itertuples()}
+    lines = []
+    for row in plan.rows:
+        own = {
+            r.agent: r
+            for r in cells[cells["row"] == row.name].itertuples()
+            if r.measure == (baseline if r.agent in BASELINES else measure)
+        }
+        where = f"{row.name} = {', '.join(t.partition('=')[2] for t in row.trained)}"
+        if measure != "id":
+            where = f"{row.name} = {row.unseen.partition('=')[2]}"
+        test = tested.get(row.name)
+        p_values = ["-", "-"] if test is None else [p_text(test.p_welch), p_text(test.p_welch_holm)]
+        lines.append([where, "return", *(_cell_text(own[a]) for a in agents), *p_values])
+        if any(not pd.isna(own[a].progress) for a in agents):
+            lines.append([where, "progress", *(_number(own[a].progress) for a in agents), "", ""])
+        if measure == "id":
+            ratios = [own[a].of_expert for a in plan.methods]
+            shares = ["-" if r is pd.NA else f"{r:.0%}" for r in ratios]
+            lines.append([where, "of the expert", *shares, "", "", ""])
+        printed = paper.TABLE1.get((row.env, row.knob))
+        if plan.kind == "table1" and measure == "transfer" and printed is not None:
+            texts = {
+                a: f"{v.mean} ± {v.deviation}"
+                for a, v in (("erm", printed.erm), ("irm", printed.irm), ("expert", printed.expert))
+            }
+            welch = p_text(_printed_p(printed, welch=True))
+            lines.append([where, "paper", *(texts.get(a, "") for a in agents), welch, ""])
+    note = (
+        "Mean true return ± standard deviation over seeds. p: Welch, AIRL-IRM against AIRL-ERM; "
+        "Holm: over the rows that have a p-value. (3/5): seeds there are of those wanted. "
+        "† not imitated in distribution. ‡ made on more than one commit or set of libraries. "
+        "Progress: the part of the return that walking or reaching earned (an idle ant earns about "
+        "600 for being alive)."
+    )
+    columns = ["setting", "", *(TITLES[a] for a in agents), "p", "Holm"]
+    note = note if measure == plan.measures[0] else ""
+    return Table(MEASURES[measure], note, columns, lines, heads=2)
+
+
+def _printed_p(row: paper.Row, welch: bool) -> float:
+    from scipy.stats import ttest_ind_from_stats
+
+    n = paper.SEEDS
+    test = ttest_ind_from_stats(*row.irm, n, *row.erm, n, equal_var=not welch)
+    return float(test.pvalue)
+
+
+def _comparison_table(comparisons: pd.DataFrame) -> Table:
+    lines = []
+    for r in comparisons[comparisons["difference"].notna()].itertuples():
+        printed = paper.TABLE1.get(tuple(r.row.split(" ", 1)))
+        shown = r.measure == "transfer" and (r.x, r.y) == ("irm", "erm") and printed is not None
+        lines.append(
+            [
+                r.row,
+                r.measure,
+                f"{TITLES[r.x]} - {TITLES[r.y]}",
+                _number(r.difference),
+                p_text(r.p_welch),
+                p_text(r.p_welch_holm),
+                p_text(r.p_student),
+                p_text(_printed_p(printed, welch=False)) if shown else "",
+                _number(r.improvement, 2),
+                r.why or ("not imitated: the gap is noise" if r.not_imitated else ""),
+            ]
+        )
+    note = (
+        "Two-sided. Welch's test is the primary one; Student's, with equal variances, is what the "
+        "paper used (its value recomputed from its means and deviations, n = 5). P(better): "
+        "probability that a seed of the first beats one of the second, ties by half."
+    )
+    columns = ["row", "measure", "difference of", "means", "Welch", "Welch, Holm", "Student"]
+    return Table(
+        "Comparisons", note, [*columns, "Student, paper", "P(better)", "remark"], lines, heads=3
+    )
+
+
+def _cell_table(cells: pd.DataFrame) -> Table:
+    lines = [
+        [
+            r.row,
+            TITLES[r.agent],
+            r.measure,
+            f"{r.seeds}/{r.seeds_wanted}",
+            _number(r.mean),
+            _number(r.deviation),
+            "-" if pd.isna(r.low) else f"[{r.low:.1f}, {r.high:.1f}]",
+            _number(r.iqm),
+            _number(r.progress),
+        ]
+        for r in cells.itertuples()
+    ]
+    note = (
+        "Interval: 95 % of the mean by the percentile bootstrap over seeds, too narrow with few. "
+        "IQM: mean of the middle half of the seeds. The expert, the random and the idle agent are "
+        "one policy each."
+    )
+    columns = ["row", "agent", "measure", "seeds", "mean", "sd", "95 %", "IQM", "progress"]
+    return Table("Every cell", note, columns, lines, heads=3)
+
+
+def _budgets(plan: Plan) -> Table:
+    lines = []
+    for row in plan.rows:
+        s = row.settings
+        lines.append(
+            [
+                row.name,
+                f"{s['expert']['total_steps']:,}",
+                ", ".join(map(str, row.demonstrations)),
+                f"{s['airl']['total_steps']:,}",
+                ", ".join(f"{run}: {weight:g}" for run, weight in row.chosen.items())
+                or f"{s['airl']['penalty_weight']:g}",
+                s["airl"].get("select", "last"),
+                f"{s['transfer']['total_steps']:,}" if "transfer" in plan.measures else "-",
+                str(s["evaluation"]["episodes"]),
+            ]
+        )
+    columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda", "round"]
+    note = (
+        "Demonstrations: episodes of each setting trained in. Lambda: the weight of IRM's penalty, by "
+        "method and seed where it was chosen by leaving a setting out. Round: the one kept."
+    )
+    return Table("Budgets", note, [*columns, "transfer steps", "evaluation episodes"], lines)
+
+
+def _costs(plan: Plan) -> Table:
+    lines = []
+    for row in plan.rows:
+        ids = lineage(plan, (c.run for c in plan.cells if c.row == row.name and c.run))
+        stages: dict[str, list[Any]] = {}
+        for id16 in ids:
+            stages.setdefault(plan.runs[id16].stage, []).append(plan.runs[id16])
+        for stage, runs in sorted(stages.items()):
+            seconds = [r.seconds for r in runs if r.seconds is not None]
+            lines.append(
+                [
+                    row.name,
+                    stage,
+                    str(len(runs)),
+                    duration(float(np.median(seconds))) if seconds else "-",
+                    duration(sum(seconds)) if seconds else "-",
+                    str(sum(1 for r in runs if r.resumed)),
+                    ", ".join(_commits(runs)),
+                ]
+            )
+    note = (
+        "Time of one process on a machine that other runs shared; a resumed run counts what it took "
+        "after it was resumed. + marks uncommitted changes."
+    )
+    columns = ["row", "stage", "runs", "median time", "in all", "resumed", "commits"]
+    return Table("What ran", note, columns, lines, heads=2)
+
+
+def _commits(runs: Sequence[Any]) -> list[str]:
+    texts = {f"{(r.commit or 'unknown')[:10]}{'+' if r.dirty else ''}" for r in runs}
+    return sorted(texts)
+
+
+def duration(seconds: float) -> str:
+    """``1:02:03`` (hours) or ``2:03`` (minutes)."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """Cells, comparisons, tables and notes as JSON values."""
+
+    def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+        plain = table.astype(object).where(table.notna(), None)
+        return plain.to_dict("records")
+
+    return {
+        "cells": records(report.cells),
+        "comparisons": records(report.comparisons),
+        "points": records(report.points),
+        "tables": [t._asdict() for t in report.tables],
+        "notes": report.notes,
+    }

@@ -1,0 +1,165 @@
+"""A table or figure of the paper from evaluations: numbers, statistics, curves, and one page.
+
+Its inputs are evaluations and learning curves, known by their content. What else it prints (which
+run on which commit took how long) are parameters, so that equal requests give equal bytes.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from irlcli.stages import Job, Request, Source, Stage
+
+
+class Cell(msgspec.Struct, frozen=True, kw_only=False):
+    """One evaluation that the table needs.
+
+    Attributes:
+        row: ``ENV KNOB``.
+        agent: a method, ``expert``, ``random`` or ``idle``.
+        measure: ``transfer``, ``zero-shot``, ``id``, or ``ood`` of an agent that learns nothing.
+        seed: of the reward learning; None for agents without one.
+        place: the setting, where an agent has an evaluation for each.
+        run: id of the evaluation; empty if it is not there.
+        why: what a missing one waits for.
+    """
+
+    row: str
+    agent: str
+    measure: str
+    seed: int | None = None
+    place: str = ""
+    run: str = ""
+    why: str = ""
+
+    @property
+    def role(self) -> str:
+        """Name of the evaluation among the inputs."""
+        seed = "-" if self.seed is None else self.seed
+        return f"{self.row} {self.agent} {seed} {self.measure} {self.place}".strip()
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One environment and knob: the settings, and every setting (in both senses) of its stages.
+
+    ``chosen`` maps ``METHOD SEED`` to its lambda where that was chosen by leaving a setting out.
+    """
+
+    env: str
+    knob: str
+    trained: tuple[str, ...]
+    unseen: str
+    demonstrations: tuple[int, ...]
+    settings: dict[str, Any]
+    chosen: dict[str, float] = {}
+
+    @property
+    def name(self) -> str:
+        """``ENV KNOB``."""
+        return f"{self.env} {self.knob}"
+
+
+class Run(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of one artefact; None where its provenance does not say.
+
+    ``libraries`` names an entry of :attr:`Parameters.libraries`, ``inputs`` are artefacts' ids.
+    """
+
+    stage: str
+    about: str
+    commit: str | None
+    dirty: str | None
+    libraries: str
+    seconds: float | None
+    resumed: int | None
+    inputs: tuple[str, ...]
+
+
+class Others(msgspec.Struct, frozen=True, kw_only=True):
+    """Runs of what a cell is about that were made otherwise and are therefore left out."""
+
+    stage: str
+    about: str
+    why: str
+    ids: tuple[str, ...]
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a report depends on, besides its evaluations and learning curves."""
+
+    kind: str
+    title: str
+    command: str
+    measures: tuple[str, ...]
+    rows: tuple[Row, ...]
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    runs: dict[str, Run]
+    libraries: dict[str, dict[str, str | None]]
+    others: tuple[Others, ...]
+
+
+def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
+    """The report on ``sources``: evaluations by :attr:`Cell.role`, and ``metrics.parquet`` files.
+
+    The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. Outputs
+    ``README.md``, ``KIND.csv`` (a row per cell), ``seeds.csv`` (every seed's point),
+    ``comparisons.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``.
+    """
+    return Request(STAGE, parameters, dict(sources), f"report {parameters.kind}")
+
+
+def run(job: Job) -> None:
+    """Read the evaluations and write what is said of them; nothing is computed but statistics."""
+    import pandas as pd
+
+    from irlcli import descriptions
+    from irlcli.report import curves, pages, results
+    from irlcli.stages.outputs import write_json
+    from irlcli.store import read_json
+
+    p: Parameters = job.parameters
+    points, episodes = [], {}
+    for cell in p.cells:
+        if not cell.run:
+            continue
+        directory = job.inputs[cell.role]
+        path = directory / "summary.json"
+        summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
+        base = {"row": cell.row, "agent": cell.agent, "measure": cell.measure, "seed": cell.seed}
+        points += [
+            {
+                **base,
+                "setting": place.setting,
+                "true_return": place.mean_return,
+                "progress": place.mean_progress,
+                "episodes": place.episodes,
+                "evaluation": cell.run,
+            }
+            for place in summary.settings
+        ]
+        if cell.seed is not None:
+            returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
+            group = episodes.setdefault((cell.row, cell.measure), {})
+            group[cell.agent, cell.seed] = returns["true_return"].to_numpy()
+    report = results.build(p, pd.DataFrame(points), episodes)
+    learning = {
+        role: pd.read_parquet(path)
+        for role, path in job.inputs.items()
+        if role.endswith("-learning")
+    }
+    report.cells.to_csv(job.output / f"{p.kind}.csv", **_CSV)
+    report.points.to_csv(job.output / "seeds.csv", **_CSV)
+    report.comparisons.to_csv(job.output / "comparisons.csv", **_CSV)
+    write_json(job.output / f"{p.kind}.json", results.as_json(report))
+    (job.output / "README.md").write_text(pages.markdown(p, report))
+    (job.output / f"{p.kind}.tex").write_text(pages.latex(report))
+    picture = curves.draw_points(job.output, p, report)
+    pictures = curves.learning_curves(p, learning)
+    (job.output / f"{p.kind}.html").write_text(pages.html(p, report, picture, pictures))
+
+
+_CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
+STAGE = Stage("report", 1, run)

@@ -1,0 +1,301 @@
+"""A report's numbers and reservations, from evaluations made up here."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+from msgspec.structs import replace
+
+from irlcli.report import pages, results
+from irlcli.report.tables import latex_table, latex_text, markdown_table
+from irlcli.settings import Settings
+from irlcli.stages.results import Cell, Others, Parameters, Row, Run
+
+SETTINGS = {
+    "expert": {"total_steps": 1000},
+    "demonstrations": {"episodes": 20},
+    "airl": {"total_steps": 2000, "penalty_weight": 1.0},
+    "transfer": {"total_steps": 3000},
+    "evaluation": {"episodes": 20},
+}
+ROWS = tuple(
+    Row(
+        env="lunar-lander",
+        knob=knob,
+        trained=tuple(f"{knob}={v}" for v in trained),
+        unseen=f"{knob}={unseen}",
+        demonstrations=(20, 20),
+        settings=SETTINGS,
+    )
+    for knob, trained, unseen in (
+        ("bounce", ("0.1", "0.5"), "0.9"),
+        ("engine-power", ("1x", "1.25x"), "1.5x"),
+    )
+)
+
+
+def evaluation(number, commit="c0ffee", dirty=None, inputs=()):
+    return Run(
+        stage="evaluate",
+        about=f"run {number}",
+        commit=commit,
+        dirty=dirty,
+        libraries="lib",
+        seconds=90.0,
+        resumed=0,
+        inputs=inputs,
+    )
+
+
+def made(values, **more):
+    """A plan and its points; ``values`` maps (row, agent, measure) to a return for each seed."""
+    cells, points, runs = [], [], {}
+    for (row, agent, measure), returns in values.items():
+        for seed, value in enumerate(returns):
+            learns = agent in ("erm", "irm", "erm-balanced", "irm-shuffled")
+            id16 = f"{len(runs):016x}"
+            there = value is not None
+            cells.append(
+                Cell(
+                    row,
+                    agent,
+                    measure,
+                    seed if learns else None,
+                    run=id16 if there else "",
+                    why="" if there else "train-airl has not run",
+                )
+            )
+            if there:
+                runs[id16] = evaluation(len(runs))
+                points.append(
+                    {
+                        **{"row": row, "agent": agent, "measure": measure},
+                        **{"seed": seed if learns else None, "setting": "bounce=0.9"},
+                        **{"true_return": value, "progress": None, "episodes": 20},
+                        "evaluation": id16,
+                    }
+                )
+    given = {"rows": ROWS, "methods": ("erm", "irm"), "seeds": (0, 1, 2), "others": ()} | more
+    plan = Parameters(
+        kind="table1",
+        title="Table 1",
+        command="irl report table1",
+        measures=("transfer", "zero-shot", "id"),
+        cells=tuple(cells),
+        runs=runs,
+        libraries={"lib": {"numpy": "2"}},
+        **given,
+    )
+    return plan, pd.DataFrame(points)
+
+
+def full(student=200.0):
+    values = {}
+    for row in ("lunar-lander bounce", "lunar-lander engine-power"):
+        values |= {
+            (row, "expert", "ood"): [250.0],
+            (row, "random", "ood"): [-200.0],
+            (row, "idle", "ood"): [-120.0],
+            (row, "expert", "id"): [250.0],
+            (row, "erm", "id"): [student - 1, student, student + 1],
+            (row, "irm", "id"): [240.0, 241.0, 242.0],
+            (row, "erm", "zero-shot"): [100.0, 110.0, 120.0],
+            (row, "irm", "zero-shot"): [150.0, 160.0, 175.0],
+            (row, "erm", "transfer"): [1.0, 2.0, 3.0],
+            (row, "irm", "transfer"): [2.0, 3.0, 7.0],
+        }
+    return values
+
+
+def cell(report, row, agent, measure):
+    c = report.cells
+    return c[(c["row"] == row) & (c["agent"] == agent) & (c["measure"] == measure)].iloc[0]
+
+
+def test_a_complete_table_has_numbers_and_nothing_to_say():
+    report = results.build(*made(full()), {})
+    found = cell(report, "lunar-lander bounce", "irm", "transfer")
+    assert (found["mean"], found["seeds"], found["seeds_wanted"]) == (4.0, 3, 3)
+    assert found["deviation"] == pytest.approx(7**0.5)
+    first = report.comparisons.iloc[0]
+    assert (first["row"], first["x"], first["y"]) == ("lunar-lander bounce", "irm", "erm")
+    assert first["difference"] == 2.0
+    # Two rows with the same p: Holm doubles it.
+    assert first["p_welch_holm"] == pytest.approx(2 * first["p_welch"])
+    assert first["improvement"] == pytest.approx((1.5 + 2.5 + 3) / 9)
+    assert report.notes == []
+
+
+def test_the_papers_numbers_stand_under_ours():
+    report = results.build(*made(full()), {})
+    table = report.tables[0]
+    ours, theirs = table.rows[:2]
+    assert ours[:4] == ["lunar-lander bounce = 0.9", "return", "2.0 ± 1.0", "4.0 ± 2.6"]
+    assert theirs[1:5] == ["paper", "93.1 ± 30.6", "156.8 ± 53.1", "230.3 ± 15.6"]
+    assert theirs[table.columns.index("p")] == "0.057"
+    (comparisons,) = (t for t in report.tables if t.title == "Comparisons")
+    assert comparisons.rows[0][comparisons.columns.index("Student, paper")] == "0.049"
+
+
+@pytest.mark.parametrize(
+    ("student", "expert", "expected"),
+    [
+        *((80.0, 100.0, True), (79.9, 100.0, False), (-11.9, -10.0, True), (-12.1, -10.0, False)),
+        *((None, 1.0, None), (1.0, None, None), (0.0, 0.0, True)),
+    ],
+)
+def test_imitation_is_within_a_fifth_of_the_expert(student, expert, expected):
+    assert results.imitates(student, expert) is expected
+
+
+def test_a_student_that_did_not_imitate_is_marked_everywhere():
+    report = results.build(*made(full(student=199.0)), {})
+    assert not cell(report, "lunar-lander bounce", "erm", "id")["imitated"]
+    assert cell(report, "lunar-lander bounce", "irm", "id")["imitated"]
+    assert cell(report, "lunar-lander bounce", "erm", "id")["of_expert"] == pytest.approx(0.796)
+    assert set(report.comparisons["not_imitated"]) == {"erm"}
+    marked = [
+        n for n in report.notes if n.startswith("Not imitated: lunar-lander bounce, AIRL-ERM")
+    ]
+    assert len(marked) == 1 and "80% of the expert" in marked[0]
+    (table,) = (t for t in report.tables if t.title.startswith("In distribution"))
+    assert table.rows[0][2] == "199.0 ± 1.0 †"
+
+
+def test_missing_seeds_are_counted_and_one_seed_has_no_p():
+    values = full()
+    values["lunar-lander bounce", "irm", "transfer"] = [5.0, None, None]
+    values["lunar-lander engine-power", "irm", "transfer"] = [None] * 3
+    report = results.build(*made(values), {})
+    assert report.tables[0].rows[0][3] == "5.0 (1/3)"
+    c = report.comparisons[report.comparisons["measure"] == "transfer"]
+    assert c["p_welch"].isna().all() and c["p_welch_holm"].isna().all()
+    assert "one seed" in c.iloc[0]["why"] and "no seed" in c.iloc[1]["why"]
+    assert any(
+        n.startswith("Missing: lunar-lander bounce: 20 of 22") and "AIRL-IRM 1, 2" in n
+        for n in report.notes
+    )
+    assert any(n.startswith("No p-value: lunar-lander bounce: 1 of 3") for n in report.notes)
+
+
+def test_runs_that_cannot_be_told_apart_are_named():
+    same = {("irm", s): np.array([1.0, 2.0 + (s == 2)]) for s in range(3)}
+    report = results.build(*made(full()), {("lunar-lander bounce", "transfer"): same})
+    (note,) = report.notes
+    assert note.startswith("Identical: lunar-lander bounce, transfer: AIRL-IRM seed 0, AIRL-IRM")
+    assert "seed 2" not in note
+    methods = {("irm", 0): same["irm", 0], ("erm", 0): same["irm", 0]}
+    report = results.build(*made(full()), {("lunar-lander bounce", "id"): methods})
+    assert "AIRL-IRM seed 0, AIRL-ERM seed 0 have the same returns" in report.notes[0]
+
+
+def test_other_commits_behind_a_cell_are_marked_also_far_behind_it():
+    plan, points = made(full())
+    old = Run(**{**{f: getattr(evaluation(0), f) for f in Run.__struct_fields__}, "commit": "0ld"})
+    (target,) = (
+        c
+        for c in plan.cells
+        if (c.row, c.agent, c.measure, c.seed) == ("lunar-lander bounce", "irm", "transfer", 2)
+    )
+    runs = {**plan.runs, "parent": evaluation(1, inputs=("expert",)), "expert": old}
+    runs[target.run] = evaluation(2, inputs=("parent",))
+    report = results.build(replace(plan, runs=runs), points, {})
+    assert cell(report, "lunar-lander bounce", "irm", "transfer")["mixed"]
+    assert not cell(report, "lunar-lander bounce", "erm", "transfer")["mixed"]
+    assert report.tables[0].rows[0][3].endswith("‡")
+    (note,) = report.notes
+    assert note.startswith("Mixed: lunar-lander bounce") and "commit 0ld" in note
+
+
+def test_uncommitted_changes_count_as_another_code():
+    plan, points = made(full())
+    runs = dict(plan.runs)
+    runs[plan.cells[0].run] = evaluation(0, dirty="abc")
+    notes = results.build(replace(plan, runs=runs), points, {}).notes
+    assert len(notes) == 1 and "with changes abc" in notes[0]
+
+
+def test_runs_made_otherwise_are_counted_and_named():
+    others = Others(stage="train-airl", about="x irm", why="seed 1 instead of 0", ids=("aa", "bb"))
+    (note,) = results.build(*made(full(), others=(others,)), {}).notes
+    assert note == "Left out: 2 runs of train-airl, x irm (aa, bb): seed 1 instead of 0."
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and collects attributes."""
+
+    VOID = frozenset({"meta", "br", "img", "link"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.attributes, self.text = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes += [(tag, *a) for a in attributes]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.attributes += [(tag, *a) for a in attributes]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def parsed(page):
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    return tags
+
+
+def test_the_page_is_whole_and_needs_nothing_else():
+    plan, points = made(full(), others=())
+    plan = replace(plan, title="<script>alert(1)</script> & co")
+    report = results.build(plan, points, {})
+    page = pages.html(plan, report, "<svg><g/></svg>", {"curves": "<svg></svg>"})
+    tags = parsed(page)
+    assert not [a for a in tags.attributes if a[0] == "script" or a[1] in ("src", "onload")]
+    links = [value for _, name, value in tags.attributes if name == "href"]
+    ids = {value for _, name, value in tags.attributes if name == "id"}
+    assert links and all(link.startswith("#") and link[1:] in ids for link in links)
+    assert not re.search(r"url\(|@import|http", page)
+    text = "".join(tags.text)
+    assert "<script>alert(1)</script> & co" in text
+    for wanted in ("156.8 ± 53.1", "4.0 ± 2.6", plan.cells[0].run, "c0ffee"):
+        assert wanted in text
+    assert "prefers-color-scheme: dark" in page and "@media print" in page
+
+
+def test_markdown_and_latex_escape_what_they_must():
+    assert markdown_table(["a"], [["x|y"]]).splitlines()[-1] == "| x\\|y |"
+    assert latex_text("50 % of a_b & {c} ± 1 < 2") == (r"50 \% of a\_b \& \{c\} $\pm$ 1 $<$ 2")
+    table = latex_table(["a", "b"], [["1", "2"]], "C")
+    assert table.index(r"\toprule") < table.index(r"\midrule") < table.index(r"\bottomrule")
+    assert "a & b \\\\" in table and r"\begin{tabular}{ll}" in table
+
+
+def test_markdown_tables_are_rectangular():
+    plan, points = made(full())
+    text = pages.markdown(plan, results.build(plan, points, {}))
+    blocks = re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)
+    assert len(blocks) == len(results.build(plan, points, {}).tables)
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+
+
+def test_settings_of_the_rows_are_those_that_the_budgets_read():
+    import msgspec
+
+    tree = msgspec.to_builtins(Settings())
+    for stage, values in SETTINGS.items():
+        assert set(values) <= set(tree[stage])
+
+
+def test_durations_are_read_by_people():
+    assert [results.duration(s) for s in (0, 59.6, 61, 3725)] == ["0:00", "1:00", "1:01", "1:02:05"]

@@ -1,0 +1,279 @@
+"""`irl report table1` and its kin, end to end through the command line, on small budgets."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from test_architecture import loaded_by
+
+from irlcli.experiments import EXPERIMENTS
+from irlcli.settings import load_settings
+from irlcli.store import Store
+
+ROOT = Path(__file__).parent.parent
+SMALL = ["--set", "airl.total_steps=2048", "--set", "transfer.total_steps=1024"]
+SMALL += ["--set", "evaluation.episodes=2", "--set", "expert.total_steps=1024"]
+ROW = ["--env", "lunar-lander"]
+
+
+@pytest.fixture(scope="module")
+def table_store(tmp_path_factory, run_irl):
+    """One row of Table 1 (engine power): ERM and IRM, seeds 0 and 1; seed 1 of IRM stops early."""
+    store = tmp_path_factory.mktemp("table1") / "runs"
+
+    def irl(*arguments):
+        common = ["--store", str(store), "--profile", "smoke", "--quiet", *SMALL]
+        done = run_irl([*arguments, *common])
+        assert done.code == 0, done.err
+
+    where = [*ROW, "--ood", "engine-power"]
+    for agent in ("--expert", "--random", "--idle"):
+        irl("evaluate", agent, *where)
+    irl("collect-experts", *ROW, "--intervention", "engine-power", "--name", "demos")
+    irl("evaluate", "--expert", *ROW, "--intervention", "engine-power")
+    for method in ("erm", "irm"):
+        for seed in "01":
+            name = f"{method}.{seed}"
+            learn = ["train-airl", "--demos", "demos", "--method", method, "--seed", seed]
+            irl(*learn, "--name", name)
+            irl("evaluate", "--policy", name, "--ood", "engine-power", "--name", f"{name}.zero")
+            irl("evaluate", "--policy", name, "--intervention", "engine-power")
+            if name != "irm.1":
+                moved = f"{name}.transfer"
+                to = ["--ood", "engine-power", "--seed", seed, "--name", moved]
+                irl("transfer", "--reward", name, *to)
+                irl("evaluate", "--policy", moved, "--name", f"{moved}-returns")
+    return store
+
+
+@pytest.fixture
+def report(irl):
+    """``report("table1", store, ...)``: ``irl report`` with the budgets of the store."""
+
+    def run(kind, store, *more, methods="erm,irm", seeds="0,1", small=SMALL):
+        chosen = ["--methods", methods, "--seeds", seeds]
+        return irl("report", kind, "--store", store, "--profile", "smoke", *small, *chosen, *more)
+
+    return run
+
+
+def notes(result):
+    return [line[2:] for line in result.err.splitlines() if line.startswith("- ")]
+
+
+def test_the_report_says_what_the_evaluations_say(report, table_store):
+    done = report("table1", table_store, *ROW)
+    assert done.code == 0, done.err
+    directory = Path(done.out.strip())
+    names = {p.name for p in directory.iterdir()} - {"manifest.json", "provenance.json"}
+    kinds = {f"table1.{e}" for e in ("csv", "html", "json", "pdf", "png", "tex")}
+    assert names == kinds | {"README.md", "seeds.csv", "comparisons.csv"}
+
+    store = Store(table_store)
+    points = pd.read_csv(directory / "seeds.csv")
+    for name, agent, seed, measure in (
+        ("erm.0.transfer-returns", "erm", 0, "transfer"),
+        ("erm.1.zero", "erm", 1, "zero-shot"),
+        ("irm.1.zero", "irm", 1, "zero-shot"),
+    ):
+        artefact = store.resolve(name).artefact
+        summary = json.loads((artefact.directory / "summary.json").read_text())
+        chosen = points[
+            (points["agent"] == agent) & (points["seed"] == seed) & (points["measure"] == measure)
+        ]
+        assert list(chosen["evaluation"].astype(str)) == [artefact.id]
+        (place,) = summary["settings"]
+        assert chosen["true_return"].item() == pytest.approx(place["mean_return"], rel=1e-5)
+    in_distribution = points[(points["measure"] == "id") & (points["agent"] == "irm")]
+    assert sorted(set(in_distribution["setting"])) == ["engine-power=1.25x", "engine-power=1x"]
+
+    cells = pd.read_csv(directory / "table1.csv").set_index(["row", "agent", "measure"])
+    erm = cells.loc[("lunar-lander engine-power", "erm", "transfer")]
+    assert erm["seeds"] == erm["seeds_wanted"] == 2
+    mine = points[(points["agent"] == "erm") & (points["measure"] == "transfer")]["true_return"]
+    assert erm["mean"] == pytest.approx(mine.mean(), rel=1e-5)
+    assert erm["deviation"] == pytest.approx(mine.std(), rel=1e-4)
+    assert cells.loc[("lunar-lander bounce", "erm", "transfer"), "seeds"] == 0
+
+
+def test_what_is_missing_is_said(report, table_store):
+    done = report("table1", table_store, *ROW)
+    said = notes(done)
+    assert any(n.startswith("Missing: lunar-lander bounce: 0 of ") for n in said)
+    (mine,) = (n for n in said if n.startswith("Missing: lunar-lander engine-power"))
+    assert "transfer has not run: AIRL-IRM 1." in mine
+    assert any("one seed has no variance" in n for n in said if n.startswith("No p-value"))
+    assert re.search(r"lunar-lander engine-power = 1.5x +return .*\(1/2\)", done.err)
+
+
+def test_a_report_is_a_function_of_what_it_stands_on(report, irl, table_store, tmp_path):
+    first, second = (report("table1", table_store, *ROW).out.strip() for _ in range(2))
+    assert first == second
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    for path in (copy / ".keys").iterdir():
+        if path.read_text().strip() == Path(first).name:
+            path.unlink()
+    remade = report("table1", copy, *ROW, "--name", "table")
+    assert Path(remade.out.strip()).name == Path(first).name
+    assert "gave other bytes" not in remade.err
+    # A name on the report keeps everything behind it.
+    collected = irl("gc", "--store", copy, "--grace-days", "0", "--json")
+    assert json.loads(collected.out)["artefacts"] == []
+    lineage = irl("lineage", "table", "--store", copy).out
+    assert "train-expert" in lineage and "train-airl" in lineage
+
+
+def test_a_report_that_is_there_loads_nothing_heavy(report, table_store):
+    assert report("table1", table_store, *ROW).code == 0
+    chosen = ["--methods", "erm,irm", "--seeds", "0,1", *ROW, "--profile", "smoke", *SMALL]
+    assert loaded_by("report", "table1", "--store", str(table_store), *chosen) == "LOADED []"
+    assert loaded_by("report", "table2") == "LOADED []"
+
+
+def test_json_holds_the_tables(report, table_store):
+    done = report("table1", table_store, *ROW, "--json")
+    value = json.loads(done.out)
+    assert value["kind"] == "artefact" and "table1.html" in value["outputs"]
+    assert value["report"]["notes"] == notes(report("table1", table_store, *ROW))
+    agents = {(c["agent"], c["measure"]) for c in value["report"]["cells"]}
+    assert {("erm", "transfer"), ("expert", "id"), ("random", "ood")} <= agents
+
+
+def test_nothing_is_run(report, table_store):
+    before = set(Store(table_store).ids())
+    planned = report("table1", table_store, *ROW, "--dry-run", seeds="0,1,2")
+    assert planned.out.startswith("RUN     report table1")
+    assert set(Store(table_store).ids()) == before
+    partly = report("table1", table_store, *ROW, seeds="0,1,2")
+    assert any("train-airl has not run: AIRL-ERM 2; AIRL-IRM 2" in n for n in notes(partly))
+    made = set(Store(table_store).ids()) - before
+    assert {Store(table_store).get(i).manifest.record.stage for i in made} == {"report"}
+
+
+def test_one_seed_has_no_p_value(report, table_store):
+    done = report("table1", table_store, *ROW, seeds="0")
+    found = pd.read_csv(Path(done.out.strip()) / "comparisons.csv")
+    assert found["p_welch"].isna().all() and found["p_welch_holm"].isna().all()
+    there = found[found["row"] == "lunar-lander engine-power"]
+    assert there["difference"].notna().all() and there["why"].str.contains("one seed").all()
+
+
+def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    before = Path(report("table1", copy, *ROW).out.strip())
+    other = [*SMALL, "--set", "airl.total_steps=1024"]
+    more = ["--store", copy, "--profile", "smoke", "--quiet", *other]
+    made = irl("train-airl", "--demos", "demos", "--method", "irm", "--seed", "0", *more)
+    assert made.code == 0, made.err
+    done = report("table1", copy, *ROW)
+    (left_out,) = (n for n in notes(done) if n.startswith("Left out"))
+    assert "1 run of train-airl, lunar-lander engine-power=1x engine-power=1.25x irm" in left_out
+    assert f"({Path(made.out.strip()).name})" in left_out
+    assert left_out.endswith("airl.total_steps 1024 instead of 2048.")
+    after = Path(done.out.strip())
+    assert (after / "table1.csv").read_bytes() == (before / "table1.csv").read_bytes()
+
+
+def test_other_evaluations_are_left_out_too(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    more = ["--store", copy, "--profile", "smoke", "--quiet", *SMALL, "--episodes", "3"]
+    assert irl("evaluate", "--policy", "irm.0", "--ood", "1.5x", *more).code == 0
+    (left_out,) = (n for n in notes(report("table1", copy, *ROW)) if n.startswith("Left out"))
+    assert left_out.endswith("evaluation.episodes 3 instead of 2.")
+
+
+def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    common = ["--store", copy, "--profile", "smoke", "--quiet", *SMALL]
+    choice = ["--choose-penalty", "1,10"]
+    learn = ["train-airl", "--demos", "demos", "--method", "irm", "--name", "chosen"]
+    made = irl(*learn, *choice, *common)
+    assert made.code == 0, made.err
+    assert irl("evaluate", "--policy", "chosen", "--ood", "1.5x", *common).code == 0
+    done = report("table1", copy, *ROW, *choice, "--json")
+    said = json.loads(done.out)["report"]
+    there = {(p["agent"], p["seed"]) for p in said["points"] if p["measure"] == "zero-shot"}
+    assert there == {("erm", 0), ("erm", 1), ("irm", 0)}
+    (missing,) = (n for n in said["notes"] if n.startswith("Missing: lunar-lander engine-power"))
+    assert "AIRL-IRM 1" in missing
+    (budgets,) = (t for t in said["tables"] if t["title"] == "Budgets")
+    weight = json.loads((copy / made.out.strip().split("/")[-1] / "reward.json").read_text())
+    assert budgets["rows"][1][4] == f"irm 0: {weight['airl']['penalty_weight']:g}"
+    # Without asking for it, the fixed lambda's runs are what the table is made of.
+    fixed = json.loads(report("table1", copy, *ROW, "--json").out)["report"]
+    assert sum(p["agent"] == "irm" and p["measure"] == "zero-shot" for p in fixed["points"]) == 2
+
+
+def test_a_profile_without_runs_is_no_table(report, irl, table_store):
+    done = report("table1", table_store, small=[])
+    assert done.code == 3
+    assert "holds no evaluation of table1" in done.err and "make table1" in done.err
+    assert report("figure3", table_store).code == 3
+    nowhere = irl("report", "table1", "--store", table_store.parent / "new")
+    assert nowhere.code == 3
+    assert not (table_store.parent / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "hint"),
+    [
+        (["table3"], "unknown report 'table3'", "table1, figure2"),
+        (["table1", "--methods", "erm,irn"], "unknown method 'irn'", "erm-balanced"),
+        (["table1", "--methods", "erm,erm"], "method erm is named twice", "counts once"),
+        (["table1", "--seeds", "0,0"], "seed 0 is named twice", "counts once"),
+        (["table1", "--seeds", "0-4"], "--seeds '0-4' is no list of seeds", "0,1,2,3,4"),
+        (["table1", "--seeds", "-1"], "no seed -1 or below", "0 or more"),
+        (["table1", "--env", "reacher"], "table1 has no row of 'reacher'", "ant, lunar-lander"),
+        (["table1", "demos"], "table1 takes no references", "found by their settings"),
+        (["figure2", "--seeds", "1"], "figure2 takes no --seeds", "--help"),
+        (["table2", "--format", "pdf"], "unknown --format 'pdf'", "markdown"),
+        (["table1", "--format", "latex"], "table1 takes no --format", "--help"),
+    ],
+)
+def test_bad_requests_are_refused(irl, table_store, arguments, message, hint):
+    done = irl("report", *arguments, "--store", table_store)
+    assert done.code == 2
+    first, second = done.err.splitlines()[-2:]
+    assert message in first and first.startswith("error: ")
+    assert hint in second and second.startswith("hint: ")
+
+
+def test_table2_needs_no_store_and_prints_the_settings(irl, tmp_path):
+    done = irl("report", "table2", "--json", "--store", tmp_path / "none")
+    rows = json.loads(done.out)["rows"]
+    ant = load_settings("ant").interventions
+    assert {(r["knob"], tuple(r["id"]), tuple(r["ood"])) for r in rows if r["env"] == "ant"} == {
+        (knob, values.id, values.ood) for knob, values in ant.items()
+    }
+    text = irl("report", "table2", "--store", tmp_path / "none").out
+    markdown = irl("report", "table2", "--format", "markdown", "--store", tmp_path / "none").out
+    latex = irl("report", "table2", "--format", "latex", "--store", tmp_path / "none").out
+    assert "| ant | leg-length | 1x, 2x | 3x |" in markdown
+    assert r"ant & leg-length & 1x, 2x & 3x \\" in latex
+    assert len(text.splitlines()) == 1 + len(rows) == len(markdown.splitlines()) - 1
+    assert not (tmp_path / "none").exists()
+
+
+def test_makefile_has_the_rows_of_the_reports():
+    text = (ROOT / "Makefile").read_text()
+    for kind, experiment in EXPERIMENTS.items():
+        (rows,) = re.findall(rf"^{kind.upper()}\s*:= (.*)$", text, re.MULTILINE)
+        assert [tuple(row.split(".")) for row in rows.split()] == list(experiment.rows)
+
+
+def test_goal_demonstrations_favour_the_right(irl, tmp_path):
+    """Figure 4 (Sec. 5.2): more demonstrations of y = -900; asked for, the counts are those."""
+    plan = ["--dry-run", "--json", "--store", tmp_path / "runs"]
+    collect = ["collect-experts", "--env", "ant", "--intervention"]
+    assert irl(*collect, "goal-y", *plan).code == 0
+    listed = load_settings("ant").interventions["goal-y"]
+    assert dict(zip(listed.id, listed.episodes, strict=True)) == {"-900": 10, "0": 3}
+    refused = irl(*collect, "goal-y", "--episodes", "1,2,3", *plan)
+    assert refused.code == 2 and "3 episode counts for 2 settings" in refused.err
