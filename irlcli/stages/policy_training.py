@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from irlcli import checkpoints
 from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
@@ -38,7 +39,7 @@ def train_rounds(
         trainer.load_state_dict(state["trainer"])
         if adversary is not None:
             adversary.load_state_dict(state["adversary"])
-        first, rows = state["round"], json.loads(state["rows"])
+        first, rows = state["round"], json.loads(state["rows"].numpy().tobytes())
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
         _warn(job, index, rollouts, settings)
@@ -62,7 +63,8 @@ def _state(
             "trainer": trainer.state_dict(),
             "adversary": adversary.state_dict() if adversary is not None else {},
             "round": rounds_done,
-            "rows": json.dumps(rows),
+            # As a tensor: they grow with the rounds, and the index of a tensor file is bounded.
+            "rows": torch.frombuffer(bytearray(json.dumps(rows).encode()), dtype=torch.uint8),
         }
     )
 
