@@ -3,6 +3,7 @@ carries the attempts from one process to the next."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import time
@@ -101,6 +102,7 @@ class Clock:
         return Attempt(started=self._started, seconds=seconds, **self._git)
 
 
+@functools.cache
 def libraries() -> dict[str, str | None]:
     """Versions of what a result is computed with; None for a library that is not installed."""
     # Imported here and below: a hit does without, and they take longer than it does.
