@@ -45,6 +45,7 @@ NEVER = {
     "report": {"torch", "stable_baselines3", "cli", "stages", "runner"},
     "stages": {"cli", "console", "runner", "stable_baselines3"},
     "runner": {"cli", "console"} | HEAVY,
+    "provenance": HEAVY | OURS | {"numpy", "settings"},
 }
 # Modules that planning and hits load: nothing heavy at their top level.
 LIGHT = [
@@ -55,6 +56,7 @@ LIGHT = [
     "settings",
     "interventions",
     "runner",
+    "provenance",
     "references",
     "report/returns",
     "stages/__init__",

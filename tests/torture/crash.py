@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from harness import Chain, Child, Fault, command, figures, irl, must, preload, seeded, warm_up
@@ -25,15 +26,13 @@ _YEAR = 365 * 86400
 
 def killed_at_every_call(chain: Chain, stage: str, work: Path, stride: int) -> int:
     """SIGKILL at every ``stride``-th call that changes a file; returns the number of kills."""
-    kills = 0
-    for n in range(0, _ENOUGH, stride):
+    for kills, n in enumerate(range(0, _ENOUGH, stride)):
         store = chain.fresh(stage, work / "store")
         ended = irl(store, *command(stage), fault=Fault(n))
         if ended.code == 0:
             assert n > 30, "calls were not intercepted"
             return kills
         assert ended.code == -signal.SIGKILL, ended
-        kills += 1
         chain.assert_sound(stage, store)
         chain.assert_completes(stage, store)
     raise AssertionError(f"{stage} never completed")
@@ -61,8 +60,10 @@ def killed_at_random(chain: Chain, stage: str, work: Path, wanted: int) -> tuple
     return kills, runs
 
 
-def refused_calls(chain: Chain, stage: str, work: Path, stride: int) -> int:
-    """One kind of call fails, once at each place or from there on; returns how often one did."""
+def refused_calls(
+    chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool]
+) -> int:
+    """One kind of call fails, once at a place or from there on; returns how often one did."""
     refused = 0
     for call, number in (
         ("fsync", errno.EIO),
@@ -72,7 +73,7 @@ def refused_calls(chain: Chain, stage: str, work: Path, stride: int) -> int:
         ("mkdir", errno.EDQUOT),
         ("open", errno.EROFS),
     ):
-        for persist in (False, True):
+        for persist in persists:
             for n in range(0, _ENOUGH, stride):
                 store = chain.fresh(stage, work / "store")
                 fault = Fault(n, number, persist, (call,))
@@ -171,14 +172,15 @@ def main() -> None:
         chain = Chain(work, CHEAP) if short else Chain(work)
         kills = 0
         for stage in ("grid", "train-maxent") if not short else ("train-maxent",):
-            found = killed_at_every_call(chain, stage, work, 9 if short else 1)
+            found = killed_at_every_call(chain, stage, work, 14 if short else 1)
             kills += found
             figures("crash", {f"{stage}: kills, one at every call": found})
         for stage in chain.before if not short else ("train-maxent",):
-            found, runs = killed_at_random(chain, stage, work, 3 if short else 20)
+            found, runs = killed_at_random(chain, stage, work, 2 if short else 20)
             kills += found
             figures("crash", {f"{stage}: kills at random times": found, "completed runs": runs})
-        refused = refused_calls(chain, "train-maxent", work, 12 if short else 2)
+        how = (25, (False,)) if short else (3, (False, True))
+        refused = refused_calls(chain, "train-maxent", work, *how)
         clocks = clock_set_back(chain, "train-maxent", work)
         disks = in_mount_namespace(Path(__file__), ["--full-disk"]) if not short else None
         if disks is not None:

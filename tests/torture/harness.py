@@ -84,7 +84,7 @@ class Child:
     """A forked child that runs ``irl ARGUMENTS``; checkpoints after every round."""
 
     def __init__(self, store: Path, arguments: Sequence[str], fault: Fault = Fault()):
-        self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()
+        self._log = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
         sys.stdout.flush()
         sys.stderr.flush()
         self.pid = os.fork()
