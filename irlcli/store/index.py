@@ -35,7 +35,7 @@ class Index:
         }
 
     def reached_from(self, ids: Iterable[str]) -> set[str]:
-        """The artefacts ``ids``, those of a newer schema, and the ancestors of all these."""
+        """The artefacts ``ids``, their ancestors, and those of artefacts of a newer schema."""
         reached: set[str] = set()
         pending = [id16 for id16 in ids if id16 in self.artefacts]
         for manifest in self.newer.values():
@@ -48,4 +48,4 @@ class Index:
                 reached.add(id16)
                 for sha in self.artefacts[id16].manifest.record.inputs.values():
                     pending += self._sources.get(sha, [])
-        return reached | set(self.newer)
+        return reached

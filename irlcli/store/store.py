@@ -228,8 +228,7 @@ class Store:
         if artefact.manifest.record.key != key:
             return None
         for output in artefact.manifest.outputs:
-            path = artefact.directory / output.path
-            if not path.is_file() or path.stat().st_size != output.size:
+            if not _has_size(artefact.directory / output.path, output.size):
                 raise self._damaged(artefact.directory, f"{output.path} is missing or truncated")
         return artefact
 
@@ -537,11 +536,17 @@ class Store:
             NewerFormat: a newer version made it; nothing can be said of it.
         """
         try:
-            directory, manifest = self._read(id16)
+            return self._problems(id16, quick)
         except NewerFormat:
             raise
         except IntegrityError as error:
             return [error.message]
+        except OSError as error:
+            # Also of what another process removes while it is looked at.
+            return [f"{error.filename} cannot be read ({error.strerror})"]
+
+    def _problems(self, id16: str, quick: bool) -> list[str]:
+        directory, manifest = self._read(id16)
         found = [
             problem
             for output in manifest.outputs
@@ -716,6 +721,14 @@ def _pointers(keys: Path) -> Iterator[tuple[Path, str]]:
             yield path, path.read_bytes().strip().decode("ascii", "replace")
 
 
+def _has_size(path: Path, size: int) -> bool:
+    try:
+        information = path.stat()
+    except OSError:
+        return False
+    return stat.S_ISREG(information.st_mode) and information.st_size == size
+
+
 def _older(path: Path, limit: float) -> bool:
     """Whether ``path`` was last changed before ``limit`` [s since 1970]; what is gone was not."""
     try:
@@ -746,6 +759,10 @@ def _output_problem(directory: Path, output: Output, quick: bool = False) -> str
         return f"{path} is reached through a symbolic link"
     if information.st_size != output.size:
         return f"{path} has {information.st_size} bytes instead of {output.size}"
-    if not quick and file_digest(path) != output.sha256:
+    try:
+        altered = not quick and file_digest(path) != output.sha256
+    except OSError as error:
+        return f"{path} cannot be read ({error.strerror})"
+    if altered:
         return f"{path} has other bytes than were published"
     return None

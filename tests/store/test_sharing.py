@@ -322,3 +322,20 @@ def test_integrity_errors_of_a_store_without_its_empty_directories(empty_store, 
     with pytest.raises(IntegrityError, match="damaged"):
         Store(empty_store.root).find(artefact.manifest.record.key)
     assert len(list((empty_store.root / ".quarantine").iterdir())) == 1
+
+
+@pytest.mark.parametrize("call", ["file_digest", "read_provenance", "_entries"])
+def test_verify_survives_what_disappears_while_it_is_read(empty_store, publish, monkeypatch, call):
+    """Another process collects the artefact between two looks at it: gone is not damaged."""
+    artefact = publish(empty_store).artefact
+    original = getattr(store_module, call)
+
+    def vanishing(*arguments):
+        if artefact.directory.exists():
+            artefact.directory.chmod(0o755)
+            artefact.directory.rename(empty_store.root / ".work" / "x")
+        return original(*arguments)
+
+    monkeypatch.setattr(store_module, call, vanishing)
+    assert empty_store.verify([artefact.id]) == {}
+    assert list((empty_store.root / ".quarantine").iterdir()) == []
