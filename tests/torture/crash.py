@@ -154,6 +154,7 @@ def full_disk(chain: Chain, stage: str, work: Path, stride: int) -> dict[str, in
         full += 1
         subprocess.run(["mount", "-o", "remount,size=1g", str(place)], check=True)
         chain.assert_completes(stage, store)
+    subprocess.run(["umount", str(place)], check=True)
     assert full > 0 and needed > 0
     return {"full disks": full, "KiB needed beside the inputs": needed, "KiB of inputs": inputs}
 
@@ -175,7 +176,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="irl-torture-") as name:
         work = Path(name)
         if "--full-disk" in sys.argv:
-            figures("full disk", full_disk(Chain(work, CHEAP), "train-maxent", work, 8))
+            figures("full disk", full_disk(Chain(work, CHEAP), "train-maxent", work, 2))
             return
         begin = time.monotonic()
         chain = Chain(work, CHEAP) if short else Chain(work)
