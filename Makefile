@@ -39,7 +39,7 @@ bench: $(READY)
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
 	else echo "benchmarks.bullet_step was left out: it counts instructions with valgrind"; fi
 
-# The long form of tests/torture: a script a theme, each prints its figures. About half an hour.
+# The long form of tests/torture: a script a theme, each prints its figures. Takes an hour or more.
 TORTURE ?= crash concurrency growth
 torture: $(READY)
 	@set -e; for theme in $(TORTURE); do $(VENV)/bin/python tests/torture/$$theme.py; done
