@@ -26,7 +26,7 @@ COMMON   = --store $(STORE) --profile $(PROFILE) $(SET)
 READY   := $(VENV)/.installed
 
 .DELETE_ON_ERROR:
-.PHONY: demo test bench all-results table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
+.PHONY: demo test bench torture all-results table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -45,6 +45,11 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.workers
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
 	else echo "benchmarks.bullet_step was left out: it counts instructions with valgrind"; fi
+
+# The long form of tests/torture: a script a theme, each prints its figures. Takes an hour or more.
+TORTURE ?= crash concurrency growth
+torture: $(READY)
+	@set -e; for theme in $(TORTURE); do $(VENV)/bin/python tests/torture/$$theme.py; done
 
 # LunarLander with two engine powers to learn from and a third, unseen one to transfer to.
 # One seed and about half the standard budget: a look at the whole chain, not a comparison.

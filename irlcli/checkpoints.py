@@ -13,6 +13,7 @@ import json
 import pickle
 import pickletools
 import stat
+import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +34,10 @@ SCHEMA = 1
 _MAX_BYTES = 256 << 20
 _MAX_PICKLE_BYTES = 4 << 20
 # The only globals that plain tensors, numbers, strings, dicts and lists need.
-_STORAGES = ("FloatStorage", "DoubleStorage", "LongStorage", "IntStorage", "BoolStorage")
+_STORAGES = (
+    *("FloatStorage", "DoubleStorage", "LongStorage", "IntStorage", "BoolStorage"),
+    "ByteStorage",
+)
 _GLOBALS = {
     "collections OrderedDict",
     "torch._utils _rebuild_tensor_v2",
@@ -44,6 +48,14 @@ _FORMS = {
     "tabular-reward": descriptions.TabularReward,
     "policy": descriptions.Policy,
 }
+
+
+# What a crafted archive makes zipfile, pickletools and torch raise. Not MemoryError: a machine
+# that is short of memory says nothing about a file.
+_MALFORMED = (
+    *(ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError),
+    *(AssertionError, EOFError, zipfile.BadZipFile, struct.error),
+)
 
 
 class RefusedCode(ValueError):
@@ -68,9 +80,11 @@ def from_bytes(data: bytes) -> Any:
             # Torch would read anything else as a bare pickle.
             raise ValueError("it is no zip archive")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            # Entries are stored, as torch.save writes them, so nothing unpacks to more.
-            if sum(entry.file_size for entry in archive.infolist()) > _MAX_BYTES:
-                raise ValueError(f"it declares more than {_MAX_BYTES >> 20} MiB")
+            # As torch.save writes them: so nothing unpacks to more than was read.
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("its entries are compressed")
+            if sum(entry.file_size for entry in archive.infolist()) > len(data):
+                raise ValueError("it declares more than it holds")
             (name,) = (n for n in archive.namelist() if n.split("/", 1)[-1] == "data.pkl")
             if archive.getinfo(name).file_size > _MAX_PICKLE_BYTES:
                 raise ValueError(f"its index is larger than {_MAX_PICKLE_BYTES >> 20} MiB")
@@ -80,8 +94,7 @@ def from_bytes(data: bytes) -> Any:
         raise
     except pickle.UnpicklingError as error:
         raise RefusedCode(str(error).splitlines()[0]) from None
-    except Exception as error:
-        # Whatever a crafted archive makes zipfile, pickle or torch raise.
+    except _MALFORMED as error:
         raise ValueError((str(error) or type(error).__name__).splitlines()[0][:200]) from None
 
 

@@ -4,6 +4,7 @@ import gc as garbage_collector
 import inspect
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial, wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,7 +40,8 @@ class Session:
     ):
         from irlcli.store import Store
 
-        self.store = Store(store)
+        self.console = out.TerminalConsole(quiet, tensorboard)
+        self.store = Store(store, self.console.warn)
         self.as_json = as_json
         self.profile = profile
         self.settings_file = settings
@@ -47,7 +49,10 @@ class Session:
         self._dry_run = dry_run
         self._wait = wait
         self._workers = workers
-        self.console = out.TerminalConsole(quiet, tensorboard)
+
+    def reading(self):
+        """Keep gc away for as long as a command looks at artefacts."""
+        return self.store.in_use(self._wait, partial(self.console.wait, "the store"))
 
     def settings(self, env: str, flags: dict[str, Any] | None = None):
         """Settings of ``env`` under this session's options."""
@@ -70,13 +75,16 @@ class Session:
             self._print_plan([step for request in requests for step in runner.plan(request)])
             return []
         artefacts = []
-        try:
-            for request in requests:
-                artefacts.append(runner.run(request))
-        finally:
-            self.console.close()
-        if name is not None:
-            self.store.set_name(name, artefacts[0])
+        # The store may be new: what is made now must not be collected before it has its name.
+        self.store.create()
+        with self.reading():
+            try:
+                for request in requests:
+                    artefacts.append(runner.run(request))
+            finally:
+                self.console.close()
+            if name is not None:
+                self.store.set_name(name, artefacts[0])
         for artefact in artefacts:
             record = artefact.manifest.record
             if self.as_json:
@@ -130,17 +138,27 @@ class Session:
             out.print_data(f"{step.status:8}{step.label}: {step.why}")
 
 
-def command(name: str, runs: bool = True) -> Callable:
+def command(name: str, runs: bool = True, reads: bool = True) -> Callable:
     """Register a command whose first argument is the :class:`Session` of the common options.
 
-    Commands that run stages (``runs``) also take the options that only concern these.
+    Commands that run stages (``runs``) also take the options that only concern these. While one
+    that ``reads`` is at work, nothing is collected.
     """
 
     def register(function: Callable) -> Callable:
-        _COMMANDS[name] = (function, runs)
+        _COMMANDS[name] = (_reading(function) if reads else function, runs)
         return function
 
     return register
+
+
+def _reading(function: Callable) -> Callable:
+    @wraps(function)
+    def guarded(session: Session, **values: Any) -> None:
+        with session.reading():
+            function(session, **values)
+
+    return guarded
 
 
 def _common_options(runs: bool) -> list[inspect.Parameter]:
@@ -567,6 +585,7 @@ def ls(
     names: dict[str, list[str]] = {}
     for name, id16 in session.store.names().items():
         names.setdefault(id16, []).append(name)
+    index = session.store.index()
     found = [
         {
             "id": a.id,
@@ -575,12 +594,12 @@ def ls(
             "about": _about(a.manifest.record.parameters),
             "bytes": sum(o.size for o in a.manifest.outputs),
         }
-        for a in session.store.artefacts()
+        for a in index.artefacts.values()
         if stage is None or a.manifest.record.stage == stage
     ]
     found.sort(key=lambda item: (item["stage"], item["about"], item["id"]))
     if session.as_json:
-        out.print_json("artefacts", {"artefacts": found})
+        out.print_json("artefacts", {"artefacts": found, "newer": sorted(index.newer)})
         return
     rows = [[f["id"], f["stage"], f["about"], ", ".join(f["names"])] for f in found]
     if rows:
@@ -629,7 +648,7 @@ def show(session: Session, ref: Ref) -> None:
 def lineage(session: Session, ref: Ref) -> None:
     """Show everything an artefact was made from, down to the experts."""
     artefact = _artefact(session, ref)
-    tree = _lineage(session, artefact)
+    tree = _lineage(session.store.index(), artefact, ())
     if session.as_json:
         out.print_json("lineage", tree)
         return
@@ -637,16 +656,15 @@ def lineage(session: Session, ref: Ref) -> None:
         out.print_data(line)
 
 
-def _lineage(session: Session, artefact: Any) -> dict[str, Any]:
+def _lineage(index: Any, artefact: Any, below: tuple[str, ...]) -> dict[str, Any]:
     record = artefact.manifest.record
-    inputs = [
-        {
-            "role": role,
-            "sha256": record.inputs[role],
-            "from": _lineage(session, sources[0]) if sources else None,
-        }
-        for role, sources in session.store.ancestors(artefact).items()
-    ]
+    below = (*below, artefact.id)
+    inputs = []
+    for role, sources in index.parents(artefact).items():
+        # Equal files are one content, which what was made of it may hold, too.
+        source = next((s for s in sources if s.id not in below), None)
+        origin = _lineage(index, source, below) if source is not None else None
+        inputs.append({"role": role, "sha256": record.inputs[role], "from": origin})
     about = _about(record.parameters)
     return {"id": artefact.id, "stage": record.stage, "about": about, "inputs": inputs}
 
@@ -669,25 +687,45 @@ def verify(
 ) -> None:
     """Check stored bytes against their digests; damaged artefacts go to quarantine."""
     ids = [_artefact(session, ref).id] if ref else session.store.ids()
-    damaged = session.store.verify(ids, quick)
-    if session.as_json and not damaged:
-        out.print_json("verify", {"checked": len(ids), "damaged": {}})
-    elif not damaged:
-        out.print_data(f"{len(ids)} artefacts verified")
+    found = session.store.verify(ids, quick)
+    newer = [id16 for id16, damage in found.items() if damage.newer]
+    damaged = {id16: damage for id16, damage in found.items() if not damage.newer}
+    for id16 in newer:
+        session.console.warn(f"not checked: {found[id16].problems[0]}")
+    checked = len(ids) - len(newer)
+    result = {
+        "checked": checked,
+        "newer": newer,
+        "damaged": {
+            id16: {
+                "problems": damage.problems,
+                "command": damage.command,
+                "quarantine": str(damage.place) if damage.place is not None else None,
+            }
+            for id16, damage in damaged.items()
+        },
+    }
     if damaged:
         for id16, damage in damaged.items():
             for problem in damage.problems:
                 print(f"{id16}: {problem}", file=sys.stderr)
             if damage.command:
                 print(f"{id16}: was made by: {damage.command}", file=sys.stderr)
-        raise IntegrityError(
-            f"{len(damaged)} of {len(ids)} artefacts were damaged and are in quarantine: "
-            + ", ".join(damaged),
+        moved = all(damage.place is not None for damage in damaged.values())
+        error = IntegrityError(
+            f"{len(damaged)} of {checked} artefacts {'were' if moved else 'are'} damaged"
+            f"{' and are in quarantine' if moved else ''}: {', '.join(damaged)}",
             "run the commands above again: what is missing is recomputed",
         )
+        error.details = result
+        raise error
+    if session.as_json:
+        out.print_json("verify", result)
+    else:
+        out.print_data(f"{checked} artefacts verified")
 
 
-@command("gc", runs=False)
+@command("gc", runs=False, reads=False)
 def gc(
     session: Session,
     delete: Annotated[bool, typer.Option("--delete", help="Do it; only shown by default.")] = False,
@@ -700,7 +738,8 @@ def gc(
     if delete:
         artefacts, work = session.store.collect(grace)
     else:
-        artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
+        with session.reading():
+            artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
     size = sum(o.size for a in artefacts for o in a.manifest.outputs)
     if session.as_json:
         value = {"deleted": delete, "artefacts": [a.id for a in artefacts], "bytes": size}
@@ -968,6 +1007,8 @@ def main() -> None:
         _fail(Interrupted("interrupted", "run the same command again to go on"), as_json)
     except IrlError as error:
         _fail(error, as_json)
+    except MemoryError:
+        _fail(StageFailed("out of memory", "nothing is half-written: free some and go on"), as_json)
     except OSError as error:
         if _debugging():
             raise

@@ -76,8 +76,8 @@ class TerminalConsole:
         self._print(f"warning: {message}", style="bold yellow")
 
     def wait(self, label: str, holder: str) -> None:
-        """Another process makes the same artefact."""
-        self.say(f"WAIT {label}: {holder} is making it")
+        """Another process makes the same artefact, or collects."""
+        self.say(f"WAIT {label}: {holder} is at work on it")
 
     def finish(self, artefact: Artefact, hit: bool) -> None:
         """A stage ended, or its artefact was there."""
@@ -182,7 +182,12 @@ def print_error(error: IrlError, as_json: bool) -> None:
     if as_json:
         print_json(
             "error",
-            {"message": error.message, "hint": error.hint, "exit_code": error.exit_code},
+            {
+                "message": error.message,
+                "hint": error.hint,
+                "exit_code": error.exit_code,
+                **error.details,
+            },
         )
     print(f"error: {error.message}", file=sys.stderr)
     if error.hint:

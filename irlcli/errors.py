@@ -10,7 +10,10 @@ from collections.abc import Iterable
 
 
 class IrlError(Exception):
-    """An error with a one-line message, a hint and the exit code it maps to."""
+    """An error with a one-line message, a hint and the exit code it maps to.
+
+    ``details`` are for programs: ``--json`` shows them beside the message.
+    """
 
     exit_code = 1
 
@@ -18,6 +21,7 @@ class IrlError(Exception):
         super().__init__(message)
         self.message = message
         self.hint = hint
+        self.details: dict[str, object] = {}
 
 
 class StageFailed(IrlError):

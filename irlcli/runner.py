@@ -4,20 +4,20 @@
 """
 
 import gc
-import hashlib
-import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
 
+from irlcli import provenance
 from irlcli.errors import IntegrityError, Interrupted, StageFailed, UsageError
-from irlcli.stages import Console, From, Job, Request, Source
+from irlcli.stages import Console, From, Job, Request, Source, Stage
 from irlcli.store import (
     Artefact,
     KeyRecord,
@@ -30,18 +30,6 @@ from irlcli.store import (
 )
 
 CHECKPOINT_SECONDS = 10.0
-_LIBRARIES = (
-    "torch",
-    "numpy",
-    "scipy",
-    "stable-baselines3",
-    "gymnasium",
-    "Box2D",
-    "pybullet",
-    "pyarrow",
-    "msgspec",
-    "matplotlib",
-)
 
 Status = Literal["HIT", "RUN", "RESUME", "BLOCKED"]
 
@@ -144,26 +132,32 @@ class Runner:
         Raises:
             StageFailed: the stage could not finish, or the disk is full or not writable.
             IntegrityError: an input is damaged.
-            Busy: another process works on it and this runner does not wait.
+            Busy: another process works on it, or collects, and this runner does not wait.
             Interrupted: a signal asked to stop; the checkpoint has been saved.
         """
+        try:
+            self.store.create()
+            # From the first artefact that is found to the last one that is made of it.
+            with self.store.in_use(self.wait, partial(self.console.wait, "the store")):
+                return self._run(request)
+        except OSError as error:
+            raise StageFailed(
+                f"{request.label}: {error.strerror or error}"
+                + (f": {error.filename}" if error.filename else ""),
+                "nothing was published and the checkpoint is kept: mend the cause and run "
+                "the same command again",
+            ) from error
+
+    def _run(self, request: Request) -> Artefact:
         sources: dict[str, Source] = {}
         for role, source in request.inputs.items():
             if isinstance(source, From):
-                source = _source(self.run(source.request), source.output)
+                source = _source(self._run(source.request), source.output)
             sources[role] = source
         record = self._record(request, {role: s.sha256 for role, s in sources.items()})
         artefact = self.store.find(record.key)
         if artefact is None:
-            try:
-                artefact = self._make(request, record, sources)
-            except OSError as error:
-                raise StageFailed(
-                    f"{request.label}: {error.strerror or error}"
-                    + (f": {error.filename}" if error.filename else ""),
-                    "nothing was published and the checkpoint is kept: mend the cause and run "
-                    "the same command again",
-                ) from error
+            artefact = self._make(request, record, sources)
         else:
             self.console.finish(artefact, hit=True)
         return artefact
@@ -174,26 +168,19 @@ class Runner:
 
     def _make(self, request: Request, record: KeyRecord, sources: Mapping[str, Source]) -> Artefact:
         gc.enable()
-        self.store.create()
-
-        def on_wait(holder: str) -> None:
-            self.console.wait(request.label, holder)
-
-        with (
-            self.store.in_use(),
-            self.store.working_on(record.key, self.wait, on_wait) as scratch,
-        ):
+        on_wait = partial(self.console.wait, request.label)
+        with self.store.working_on(record.key, self.wait, on_wait) as scratch:
             # The process that held the lock may have made it.
             artefact = self.store.find(record.key)
             if artefact is not None:
                 self.console.finish(artefact, hit=True)
                 return artefact
             inputs = {role: self._checked(source) for role, source in sources.items()}
-            checkpoints = _Checkpoints(scratch, self.console, self.checkpoint_seconds)
+            checkpoints = _Checkpoints(
+                request.stage, scratch, self.console, self.checkpoint_seconds
+            )
             self.console.start(request.label, checkpoints.load() is not None)
             output = scratch.new_output()
-            started = time.time()
-            git = _git_state()
             with checkpoints.listening():
                 request.stage.run(
                     Job(
@@ -205,8 +192,9 @@ class Runner:
                         self.workers,
                     )
                 )
-            provenance = self._provenance(sources, started, checkpoints.resumed, git)
-            published = self.store.publish(record, output, provenance)
+            origin = provenance.record(self.command, self.workers, checkpoints.attempts())
+            origin["inputs"] = {role: _address(source) for role, source in sources.items()}
+            published = self.store.publish(record, output, origin)
         if published.diverged is not None:
             self.console.warn(
                 f"{request.label} gave other bytes than {published.diverged.id}, which holds the "
@@ -236,64 +224,48 @@ class Runner:
             self.store.open(source.artefact, output.path)
         return source.path
 
-    def _provenance(
-        self,
-        sources: Mapping[str, Source],
-        started: float,
-        resumed: int,
-        git: dict[str, str | None],
-    ) -> dict[str, Any]:
-        # Imported here and below: a hit does without, and they take longer than it does.
-        import platform
-
-        return {
-            "command": self.command,
-            "git": git,
-            "libraries": {name: _version(name) for name in ("irlcli", *_LIBRARIES)},
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            "device": "cpu",
-            "workers": self.workers,
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
-            "seconds": round(time.time() - started, 3),
-            "resumed": resumed,
-            "inputs": {
-                role: f"{s.artefact.id}/{s.path.relative_to(s.artefact.directory)}"
-                if s.artefact
-                else str(s.path)
-                for role, s in sources.items()
-            },
-        }
-
 
 class _Checkpoints:
     """A stage's checkpoints: throttled by time, and where a stop signal is answered."""
 
-    def __init__(self, scratch: Scratch, console: Any, seconds: float):
+    def __init__(self, stage: Stage, scratch: Scratch, console: Any, seconds: float):
+        self._stage = stage
+        self._libraries = provenance.libraries()
+        self._clock = provenance.Clock()
+        self._earlier: tuple[provenance.Attempt, ...] = ()
         self._scratch = scratch
         self._console = console
         self._seconds = seconds
         self._last = time.monotonic()
         self.stop_requested = False
         self._state: bytes | None = None
-        self.resumed = 0
         try:
             stored = scratch.load()
+            if stored is not None:
+                header, self._state = provenance.decode(stored, stage.name, stage.version)
+                self._earlier = header.attempts
         except ValueError as error:
-            console.warn(f"{error}: starting over")
+            console.warn(f"the checkpoint cannot be used ({error}): starting over")
             scratch.discard_checkpoint()
-            stored = None
-        if stored is not None:
-            self.resumed = int.from_bytes(stored[:4], "big") + 1
-            self._state = stored[4:]
 
     def load(self) -> bytes | None:
         return self._state
 
+    def attempts(self) -> tuple[provenance.Attempt, ...]:
+        """Every process's part in the work so far, this one's last."""
+        return (*self._earlier, self._clock.attempt())
+
     def offer(self, state: Callable[[], bytes]) -> None:
         now = time.monotonic()
         if self.stop_requested or now - self._last >= self._seconds:
-            self._scratch.save(self.resumed.to_bytes(4, "big") + state())
+            header = provenance.Header(
+                schema=provenance.SCHEMA,
+                stage=self._stage.name,
+                stage_version=self._stage.version,
+                libraries=self._libraries,
+                attempts=self.attempts(),
+            )
+            self._scratch.save(header.encode(state()))
             self._last = now
         if self.stop_requested:
             raise Interrupted(
@@ -353,35 +325,8 @@ def _source(artefact: Artefact, output: str | None) -> Source:
     return Source(artefact.directory / output, artefact.output(output).sha256, artefact)
 
 
-def _version(library: str) -> str | None:
-    import importlib.metadata
-
-    try:
-        return importlib.metadata.version(library)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _git_state() -> dict[str, str | None]:
-    """Commit of the checkout this package runs from, and a digest of what is not committed."""
-    import shutil
-    import subprocess
-
-    here = Path(__file__).parent
-    if shutil.which("git") is None:
-        return {"commit": None, "dirty": None}
-
-    def git(*arguments: str) -> bytes | None:
-        done = subprocess.run(
-            ["git", "-C", str(here), *arguments],
-            capture_output=True,
-            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
-        )
-        return done.stdout if done.returncode == 0 else None
-
-    commit = git("rev-parse", "HEAD")
-    if commit is None or git("ls-files", "--error-unmatch", __file__) is None:
-        return {"commit": None, "dirty": None}
-    changes = git("diff", "HEAD", "--", str(here))
-    dirty = hashlib.sha256(changes).hexdigest()[:16] if changes else None
-    return {"commit": commit.decode().strip(), "dirty": dirty}
+def _address(source: Source) -> str:
+    """Where an input was when it was read: inside the store, or a foreign path."""
+    if source.artefact is None:
+        return str(source.path)
+    return f"{source.artefact.id}/{source.path.relative_to(source.artefact.directory)}"

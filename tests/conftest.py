@@ -91,7 +91,7 @@ def _build_chain(store: Path) -> dict[str, str]:
         assert done.code == 0, done.err
         ids[field] = Path(done.out.strip()).name
     demos = Store(store).get(ids["demos"])
-    (expert,) = Store(store).ancestors(demos)["expert engine-power=1x"]
+    (expert,) = Store(store).index().parents(demos)["expert engine-power=1x"]
     return {**ids, "expert": expert.id}
 
 

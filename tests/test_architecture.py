@@ -46,6 +46,7 @@ NEVER = {
     "stages": {"cli", "console", "runner", "stable_baselines3"},
     "runner": {"cli", "console"} | HEAVY,
     "experiments": {"cli", "console", "report"} | HEAVY,
+    "provenance": HEAVY | OURS | {"numpy", "settings"},
 }
 # Modules that planning and hits load: nothing heavy at their top level.
 LIGHT = [
@@ -56,6 +57,7 @@ LIGHT = [
     "settings",
     "interventions",
     "runner",
+    "provenance",
     "references",
     "experiments",
     "report/returns",

@@ -26,7 +26,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from irlcli import interventions
+from irlcli import interventions, provenance
 from irlcli.errors import IrlError
 from irlcli.store import Store
 
@@ -349,20 +349,22 @@ def test_the_hostile_files_would_run_code_where_pickles_are_trusted(tmp_path):
 @pytest.mark.parametrize("kind", hostile_pickles(Path("x")))
 def test_no_code_in_a_checkpoint_is_run(irl, store_copy, tmp_path, kind):
     """A checkpoint is as writable as the rest of the store; one that is no good is not for ever."""
-    import hashlib
-
-    key = Store(store_copy.path).get(store_copy.transfer).manifest.record.key
-    (store_copy.path / ".keys" / key).unlink()
-    data = (
-        bytes(4)
-        + torch_zip(tmp_path / "x", hostile_pickles(tmp_path / "marker")[kind]).read_bytes()
+    record = Store(store_copy.path).get(store_copy.transfer).manifest.record
+    (store_copy.path / ".keys" / record.key).unlink()
+    header = provenance.Header(
+        schema=provenance.SCHEMA,
+        stage=record.stage,
+        stage_version=record.stage_version,
+        libraries=provenance.libraries(),
+        attempts=(),
     )
-    (store_copy.path / ".work" / key).mkdir(exist_ok=True)
-    checkpoint = store_copy.path / ".work" / key / "checkpoint"
-    checkpoint.write_bytes(hashlib.sha256(data).digest() + data)
+    state = torch_zip(tmp_path / "x", hostile_pickles(tmp_path / "marker")[kind]).read_bytes()
+    with Store(store_copy.path).working_on(record.key, wait=False) as scratch:
+        scratch.save(header.encode(state))
     text = "transfer --reward airl --ood 1.5x --set transfer.total_steps=2048"
     result = irl(*arguments(text, store_copy.path))
     assert not (tmp_path / "marker").exists()
+    assert "the checkpoint cannot be used" in result.err
     assert "this is a defect" not in result.err, result.err
     if result.code != 0:
         assert_answered(result, 4, "checkpoint")

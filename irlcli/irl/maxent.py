@@ -397,14 +397,17 @@ def fit(
         done = state["iterations"]
         networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
-        records = [(i, *(a.numpy() for a in arrays)) for i, *arrays in state["records"]]
+        steps, *columns = (column.numpy() for column in state["records"])
+        records = list(zip(steps.tolist(), *columns, strict=True))
 
     def snapshot() -> dict[str, Any]:
+        # A tensor a column: their number does not grow with the iterations.
+        columns = [torch.as_tensor(np.stack(column)) for column in zip(*records, strict=True)]
         return {
             "iterations": done,
             "networks": networks.state_dict(),
             "optimizer": optimizer.state_dict(),
-            "records": [(i, *map(torch.as_tensor, arrays)) for i, *arrays in records],
+            "records": columns,
         }
 
     for i in range(done, iterations):

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from irlcli import checkpoints
 from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
@@ -43,7 +44,7 @@ def train_rounds(
             adversary.load_state_dict(state["adversary"])
         if selection is not None:
             selection.load_state_dict(state["selection"])
-        first, rows = state["round"], json.loads(state["rows"])
+        first, rows = state["round"], json.loads(state["rows"].numpy().tobytes())
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
         _warn(job, index, rollouts, settings)
@@ -78,7 +79,8 @@ def _state(
             "adversary": adversary.state_dict() if adversary is not None else {},
             "selection": selection.state_dict() if selection is not None else {},
             "round": rounds_done,
-            "rows": json.dumps(rows),
+            # As a tensor: they grow with the rounds, and the index of a tensor file is bounded.
+            "rows": torch.frombuffer(bytearray(json.dumps(rows).encode()), dtype=torch.uint8),
         }
     )
 

@@ -1,6 +1,7 @@
 """Content-addressed artefacts: digests, manifests, publishing, references, collection."""
 
 from irlcli.store.digest import canonical_json, digest, file_digest
+from irlcli.store.index import Index
 from irlcli.store.manifest import (
     KeyRecord,
     Manifest,
@@ -14,6 +15,7 @@ from irlcli.store.store import Artefact, Published, Resolved, Store
 
 __all__ = [
     "Artefact",
+    "Index",
     "KeyRecord",
     "Manifest",
     "Output",

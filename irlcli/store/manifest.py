@@ -143,6 +143,8 @@ def read_manifest(directory: Path) -> Manifest:
         canonical = manifest.encode() == path.read_bytes()
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise IntegrityError(f"{path} is malformed ({error})") from None
+    except OSError as error:
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
     if not canonical:
         raise IntegrityError(f"{path} was altered: it says the same in other bytes")
     return manifest
@@ -219,6 +221,8 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
         sound = path.read_bytes() == encode_provenance(value["artefact"], value["record"])
     except (KeyError, TypeError, ValueError, RecursionError):
         sound = False
+    except OSError as error:
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
     if not sound:
         raise IntegrityError(f"{path} was altered: its checksum does not match")
     if value["artefact"] != artefact_id:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import uuid
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 CHECKPOINT = "checkpoint"
@@ -27,17 +29,40 @@ def write_durably(path: Path, data: bytes) -> None:
     Raises:
         OSError: the disk is full or the directory not writable; ``path`` is as it was.
     """
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    with temporary_file(path, data) as temporary:
+        os.replace(temporary, path)
+    fsync_directory(path.parent)
+
+
+@contextmanager
+def temporary_file(path: Path, data: bytes) -> Iterator[Path]:
+    """``data``, durable, in a file beside ``path`` that is gone afterwards."""
+    temporary = path.with_name(_of_this_process(f".{path.name}"))
     try:
         with open(temporary, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
+        yield temporary
+    finally:
         temporary.unlink(missing_ok=True)
-        raise
-    fsync_directory(path.parent)
+
+
+def _of_this_process(stem: str) -> str:
+    """A file name nobody else uses, which says whose it is."""
+    return f"{stem}.{os.getpid()}.{uuid.uuid4().hex}.{os.uname().nodename}"
+
+
+def remove_leftovers(directory: Path) -> None:
+    """Remove what dead processes of this machine left half-written in ``directory``."""
+    node = re.escape(os.uname().nodename)
+    for path in directory.iterdir():
+        owner = re.fullmatch(rf".+\.(\d+)\.[0-9a-f]{{32}}\.{node}", path.name)
+        if owner and not _alive(int(owner[1])):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
 
 
 class Scratch:
@@ -70,14 +95,10 @@ class Scratch:
         (self.directory / CHECKPOINT).unlink(missing_ok=True)
 
     def new_output(self) -> Path:
-        """An empty directory for one attempt's outputs; those of dead processes are removed."""
+        """An empty directory for one attempt's outputs; what dead processes left is removed."""
         self.directory.mkdir(exist_ok=True)
-        node = os.uname().nodename
-        for stale in self.directory.glob("out.*"):
-            _, pid, _, *owner = stale.name.split(".", 3)
-            if owner == [node] and not _alive(int(pid)):
-                shutil.rmtree(stale)
-        path = self.directory / f"out.{os.getpid()}.{uuid.uuid4().hex}.{node}"
+        remove_leftovers(self.directory)
+        path = self.directory / _of_this_process("out")
         path.mkdir()
         return path
 

@@ -21,13 +21,24 @@ import shutil
 import stat
 import time
 import uuid
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError, closest, suggest
+from irlcli.errors import (
+    Busy,
+    IntegrityError,
+    IrlError,
+    NewerFormat,
+    NotFound,
+    UsageError,
+    closest,
+    suggest,
+)
 from irlcli.store.digest import file_digest
+from irlcli.store.index import Index
 from irlcli.store.lock import is_locked, locked
 from irlcli.store.manifest import (
     MANIFEST,
@@ -41,7 +52,13 @@ from irlcli.store.manifest import (
     read_manifest,
     read_provenance,
 )
-from irlcli.store.scratch import Scratch, fsync_directory, write_durably
+from irlcli.store.scratch import (
+    Scratch,
+    fsync_directory,
+    remove_leftovers,
+    temporary_file,
+    write_durably,
+)
 
 FORMAT = 1
 _OWN = (".keys", ".names", ".work", ".locks", ".quarantine")
@@ -92,10 +109,16 @@ class Published(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """What is wrong with an artefact, and the command that made it if it still says so."""
+    """What is wrong with an artefact, and the command that made it if it still says so.
+
+    ``place`` is where it lies in quarantine; None if it could not be moved. Of a ``newer`` schema
+    nothing is known: such an artefact is no damaged one, and stays where it is.
+    """
 
     problems: list[str]
     command: str
+    place: Path | None = None
+    newer: bool = False
 
 
 class Resolved(NamedTuple):
@@ -115,13 +138,16 @@ class Resolved(NamedTuple):
 class Store:
     """A store in the directory ``root``, created on first use.
 
+    ``warn`` is told of artefacts that are left out because a newer version made them.
+
     Raises:
         IntegrityError: ``root`` holds something else, or a store of a newer format.
         UsageError: ``root`` is not a directory.
     """
 
-    def __init__(self, root: Path | str):
+    def __init__(self, root: Path | str, warn: Callable[[str], None] = warnings.warn):
         self.root = Path(root)
+        self._warn = warn
         try:
             present = stat.S_ISDIR(self.root.stat().st_mode)
         except FileNotFoundError:
@@ -180,6 +206,8 @@ class Store:
         for directory in (self._keys(), self._names(), self._work(), self._locks()):
             directory.mkdir(parents=True, exist_ok=True)
         self._quarantine().mkdir(exist_ok=True)
+        # It is there for whoever may only read the store later.
+        (self._locks() / "gc").touch()
         write_durably(self.root / "STORE", b'{"format": %d}\n' % FORMAT)
 
     # Reading
@@ -190,30 +218,37 @@ class Store:
         Raises:
             IntegrityError: the artefact is damaged; it has been moved to quarantine.
         """
-        pointer = self._keys() / key
+        name = self._pointee(key)
+        if name is None:
+            return None
         try:
-            name = pointer.read_text("ascii").strip()
-        except FileNotFoundError:
+            artefact = self.get(name)
+        except NotFound:
             return None
-        except (UnicodeDecodeError, IsADirectoryError):
-            name = ""
-        if not re.fullmatch(_ID, name) or not (self.root / name).is_dir():
-            # The artefact was removed, or the pointer damaged: computing again repairs both.
-            return None
-        artefact = self.get(name)
         if artefact.manifest.record.key != key:
             return None
         for output in artefact.manifest.outputs:
-            path = artefact.directory / output.path
-            if not path.is_file() or path.stat().st_size != output.size:
+            if not _has_size(artefact.directory / output.path, output.size):
                 raise self._damaged(artefact.directory, f"{output.path} is missing or truncated")
         return artefact
+
+    def _pointee(self, key: str) -> str | None:
+        """The id that ``key`` points to, if there is such an artefact.
+
+        Where it was removed, or the pointer damaged, computing again repairs both.
+        """
+        try:
+            name = (self._keys() / key).read_text("ascii").strip()
+        except (FileNotFoundError, UnicodeDecodeError, IsADirectoryError):
+            return None
+        return name if re.fullmatch(_ID, name) and (self.root / name).is_dir() else None
 
     def get(self, id16: str) -> Artefact:
         """The artefact in directory ``id16``, its manifest checked against that address.
 
         Raises:
             IntegrityError: the manifest is damaged; the artefact has been moved to quarantine.
+            NotFound: there is no such artefact (any more).
         """
         try:
             return self._read(id16)
@@ -252,20 +287,44 @@ class Store:
             return []
 
     def artefacts(self) -> Iterator[Artefact]:
-        """All artefacts with a sound manifest; damaged ones raise as :meth:`get` does."""
+        """The artefacts of :meth:`index`."""
+        yield from self.index().artefacts.values()
+
+    def index(self) -> Index:
+        """All artefacts as they are now, each manifest read once.
+
+        Those of a newer schema are named in a warning; those removed meanwhile are left out.
+
+        Raises:
+            IntegrityError: as :meth:`get`.
+        """
+        artefacts, newer = {}, {}
         for name in self.ids():
-            yield self.get(name)
+            try:
+                artefacts[name] = self.get(name)
+            except NotFound:
+                continue
+            except NewerFormat as error:
+                newer[name] = (self.root / name / MANIFEST).read_bytes()
+                self._warn(f"{error.message}: left out; {error.hint}")
+        return Index(artefacts, newer)
 
     def names(self) -> dict[str, str]:
         """Name to id, sorted by name."""
         try:
-            entries = sorted(
-                p for p in self._names().iterdir() if re.fullmatch(_NAME, p.name) and p.is_file()
-            )
+            entries = sorted(path.name for path in self._names().iterdir())
         except FileNotFoundError:
             return {}
-        found = {entry.name: entry.read_text("utf-8", "replace").strip() for entry in entries}
-        return {name: id16 for name, id16 in found.items() if re.fullmatch(_ID, id16)}
+        found = {name: self._named(name) for name in entries}
+        return {name: id16 for name, id16 in found.items() if id16 is not None}
+
+    def _named(self, name: str) -> str | None:
+        """The id that ``name`` stands for; one file is read, however many names there are."""
+        path = self._names() / name
+        if not re.fullmatch(_NAME, name) or not path.is_file():
+            return None
+        id16 = path.read_text("utf-8", "replace").strip()
+        return id16 if re.fullmatch(_ID, id16) else None
 
     # References
 
@@ -298,9 +357,7 @@ class Store:
         return Resolved(artefact, artefact.directory / rest)
 
     def _by_name(self, name: str) -> Artefact | None:
-        if not re.fullmatch(_NAME, name):
-            return None
-        id16 = self.names().get(name)
+        id16 = self._named(name)
         if id16 is None:
             return None
         if not (self.root / id16).is_dir():
@@ -313,7 +370,11 @@ class Store:
         if not re.fullmatch(_PREFIX, prefix):
             return None
         short = prefix[:_ID_DIGITS]
-        matches = [name for name in self.ids() if name.startswith(short)]
+        if len(short) == _ID_DIGITS:
+            # A whole id needs no look at the others.
+            matches = [short] if os.path.lexists(self.root / short) else []
+        else:
+            matches = [name for name in self.ids() if name.startswith(short)]
         if len(matches) > 1:
             shown = ", ".join(matches[:5]) + (", ..." if len(matches) > 5 else "")
             raise NotFound(
@@ -344,19 +405,27 @@ class Store:
             UsageError: as :meth:`check_name`.
         """
         self.check_name(name)
-        if self.names().get(name) != artefact.id:
+        if self._named(name) != artefact.id:
             write_durably(self._names() / name, artefact.id.encode() + b"\n")
 
     # Writing
 
     @contextmanager
-    def in_use(self) -> Iterator[None]:
+    def in_use(
+        self, wait: bool = False, on_wait: Callable[[str], None] | None = None
+    ) -> Iterator[None]:
         """Keep ``gc`` away while artefacts are read or made.
 
+        Where there is no store yet, or none that gc could have run in, nothing keeps it away.
+
         Raises:
-            Busy: gc is running.
+            Busy: gc is running and ``wait`` is false.
         """
-        with locked(self._locks() / "gc", shared=True):
+        lock = self._locks() / "gc"
+        if not lock.exists() and not os.access(self._locks(), os.W_OK):
+            yield
+            return
+        with locked(lock, shared=True, wait=wait, on_wait=on_wait):
             yield
 
     @contextmanager
@@ -401,38 +470,60 @@ class Store:
 
     def _place(self, output: Path, manifest: Manifest) -> Artefact:
         target = self.root / manifest.id[:_ID_DIGITS]
-        try:
-            output.rename(target)
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
+        while True:
+            try:
+                output.rename(target)
+                break
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
             # Equal bytes were published before, perhaps by a process that died before its claim.
             if not self.problems(target.name):
                 shutil.rmtree(output)
-                return Artefact(target, manifest)
-            self._move_to_quarantine(target)
-            output.rename(target)
+                break
+            with suppress(FileNotFoundError):
+                self._set_aside(target)
         target.chmod(0o555)
         fsync_directory(self.root)
         return Artefact(target, manifest)
 
     def _claim(self, key: str, artefact: Artefact) -> Artefact:
         pointer = self._keys() / key
-        temporary = self._keys() / f".{key}.{uuid.uuid4().hex}"
-        write_durably(temporary, artefact.id.encode() + b"\n")
-        try:
+        with temporary_file(pointer, artefact.id.encode() + b"\n") as temporary:
             while True:
                 try:
                     os.link(temporary, pointer)
                     fsync_directory(self._keys())
                     return artefact
                 except FileExistsError:
-                    holder = self.find(key)
+                    holder = self._holder(key)
                     if holder is not None:
                         return holder
-                    pointer.unlink(missing_ok=True)
-        finally:
-            temporary.unlink(missing_ok=True)
+
+    def _holder(self, key: str) -> Artefact | None:
+        """The artefact that holds ``key``; None once a claim that leads nowhere is out of the way.
+
+        Raises:
+            IntegrityError: the holder is damaged and cannot be set aside.
+        """
+        pointer = self._keys() / key
+        try:
+            holder = self.find(key)
+        except NewerFormat:
+            raise
+        except IntegrityError:
+            # A damaged holder is in quarantine now, and its claim is gone.
+            if os.path.lexists(pointer):
+                raise
+            return None
+        if holder is not None:
+            return holder
+        with self._repairing():
+            # Looked at again: another process may have put a claim of its own in its place.
+            name = self._pointee(key)
+            if name is None or self._read(name).manifest.record.key != key:
+                pointer.unlink(missing_ok=True)
+        return None
 
     # Integrity
 
@@ -445,11 +536,17 @@ class Store:
             NewerFormat: a newer version made it; nothing can be said of it.
         """
         try:
-            directory, manifest = self._read(id16)
+            return self._problems(id16, quick)
         except NewerFormat:
             raise
         except IntegrityError as error:
             return [error.message]
+        except OSError as error:
+            # Also of what another process removes while it is looked at.
+            return [f"{error.filename} cannot be read ({error.strerror})"]
+
+    def _problems(self, id16: str, quick: bool) -> list[str]:
+        directory, manifest = self._read(id16)
         found = [
             problem
             for output in manifest.outputs
@@ -468,84 +565,98 @@ class Store:
         return found
 
     def verify(self, ids: Iterable[str], quick: bool = False) -> dict[str, Damage]:
-        """Check artefacts; the damaged ones are moved to quarantine. Returns these."""
-        damaged = {}
+        """Check artefacts; the damaged ones are moved to quarantine. Returns these.
+
+        Those of a newer schema are among them (``newer``) and stay: they cannot be judged here.
+        """
+        damaged: dict[str, Damage] = {}
         for id16 in ids:
             try:
                 problems = self.problems(id16, quick)
             except NewerFormat as error:
-                # Not for this version to judge, nor to move.
-                damaged[id16] = Damage([error.message], "")
+                damaged[id16] = Damage([f"{error.message}: {error.hint}"], "", newer=True)
                 continue
-            # Another process may have collected it, or moved it to quarantine, meanwhile.
-            if problems and (self.root / id16).is_dir():
-                damaged[id16] = Damage(problems, _recorded_command(self.root / id16))
+            if problems:
+                command, place = _recorded_command(self.root / id16), None
                 try:
-                    self._move_to_quarantine(self.root / id16)
+                    place = self._set_aside(self.root / id16)
+                    if place is None:
+                        continue
+                except FileNotFoundError:
+                    # Another process collected it, or moved it to quarantine, meanwhile.
+                    continue
                 except OSError as error:
                     problems.append(f"it could not be moved to quarantine ({error.strerror})")
+                damaged[id16] = Damage(problems, command, place)
         return damaged
 
-    def _damaged(self, directory: Path, problem: str) -> IntegrityError:
+    def _damaged(self, directory: Path, problem: str) -> IrlError:
         command = _recorded_command(directory)
         hint = f"compute it again: {command}" if command else "compute it again"
         try:
-            place = self._move_to_quarantine(directory)
+            place = self._set_aside(directory)
+        except FileNotFoundError:
+            return NotFound(
+                f"artefact {directory.name} is gone: another process removed it or set it aside",
+                "run the same command again: what is missing is recomputed",
+            )
         except OSError as error:
             return IntegrityError(
                 f"artefact {directory.name} is damaged: {problem}; it could not be moved to "
                 f"quarantine ({error.strerror})",
                 hint,
             )
+        if place is None:
+            return Busy(
+                f"artefact {directory.name} was repaired by another process while it was read",
+                "run the same command again",
+            )
         return IntegrityError(
             f"artefact {directory.name} was damaged and is now in {place}: {problem}", hint
         )
 
-    def _move_to_quarantine(self, directory: Path) -> Path:
-        for pointer in _pointers_to(self._keys(), directory.name):
-            pointer.unlink(missing_ok=True)
-        place = self._quarantine() / f"{directory.name}-{uuid.uuid4().hex[:8]}"
-        # Moving a directory to another parent rewrites its "..", which needs write permission.
-        if not directory.is_symlink():
-            directory.chmod(0o755)
-        directory.rename(place)
-        return place
+    def _repairing(self):
+        """One process at a time takes damaged things out of the way."""
+        self._locks().mkdir(exist_ok=True)
+        return locked(self._locks() / "repair", wait=True)
+
+    def _set_aside(self, directory: Path) -> Path | None:
+        """Move a damaged artefact to quarantine; None if a sound one is in its place by now.
+
+        Raises:
+            FileNotFoundError: it is gone.
+            OSError: it cannot be moved.
+        """
+        directory.lstat()
+        self._quarantine().mkdir(exist_ok=True)
+        with self._repairing():
+            directory.lstat()
+            if not self.problems(directory.name):
+                return None
+            for pointer, id16 in _pointers(self._keys()):
+                if id16 == directory.name:
+                    pointer.unlink(missing_ok=True)
+            place = self._quarantine() / f"{directory.name}-{uuid.uuid4().hex[:8]}"
+            # Moving a directory to another parent rewrites its "..", which needs write permission.
+            if not directory.is_symlink():
+                directory.chmod(0o755)
+            directory.rename(place)
+            return place
 
     # Ancestry and collection
 
-    def ancestors(self, artefact: Artefact) -> dict[str, list[Artefact]]:
-        """For each input role of ``artefact``, the artefacts that hold that content."""
-        sources = self._sources()
-        return {
-            role: [self.get(name) for name in sources.get(sha, [])]
-            for role, sha in artefact.manifest.record.inputs.items()
-        }
-
-    def _sources(self) -> dict[str, list[str]]:
-        sources: dict[str, list[str]] = {}
-        for artefact in self.artefacts():
-            contents = {o.sha256 for o in artefact.manifest.outputs} | {artefact.manifest.content}
-            for sha in contents:
-                sources.setdefault(sha, []).append(artefact.id)
-        return sources
-
     def garbage(self, grace_seconds: float) -> list[Artefact]:
-        """Artefacts that no name leads to and that are older than the grace period."""
-        sources = self._sources()
-        everything = {artefact.id: artefact for artefact in self.artefacts()}
-        reached: set[str] = set()
-        pending = [id16 for id16 in self.names().values() if id16 in everything]
-        while pending:
-            id16 = pending.pop()
-            if id16 not in reached:
-                reached.add(id16)
-                for sha in everything[id16].manifest.record.inputs.values():
-                    pending += sources.get(sha, [])
+        """Artefacts that no name leads to and that are older than the grace period.
+
+        What a newer version made is never among them, nor what its manifest mentions.
+        """
+        index = self.index()
+        kept = index.reached_from(self.names().values())
         limit = time.time() - grace_seconds
         return [
             artefact
-            for id16, artefact in everything.items()
-            if id16 not in reached and artefact.directory.stat().st_mtime < limit
+            for id16, artefact in index.artefacts.items()
+            if id16 not in kept and _older(artefact.directory, limit)
         ]
 
     def stale_work(self, grace_seconds: float) -> list[Path]:
@@ -558,11 +669,13 @@ class Store:
         return [
             path
             for path in entries
-            if path.stat().st_mtime < limit and not is_locked(self._locks() / path.name)
+            if _older(path, limit) and not is_locked(self._locks() / path.name)
         ]
 
     def collect(self, grace_seconds: float) -> tuple[list[Artefact], list[Path]]:
         """Remove ``garbage`` and ``stale_work``; returns what was removed.
+
+        Temporary files of dead processes go too, whatever their age.
 
         Raises:
             Busy: the store is in use.
@@ -571,9 +684,13 @@ class Store:
             return [], []
         with locked(self._locks() / "gc"):
             artefacts, work = self.garbage(grace_seconds), self.stale_work(grace_seconds)
+            pointers: dict[str, list[Path]] = {}
+            for pointer, id16 in _pointers(self._keys()):
+                pointers.setdefault(id16, []).append(pointer)
             for artefact in artefacts:
-                for pointer in _pointers_to(self._keys(), artefact.id):
+                for pointer in pointers.get(artefact.id, []):
                     pointer.unlink(missing_ok=True)
+                    (self._locks() / pointer.name).unlink(missing_ok=True)
                 # A name of its own: a crash may have left an earlier one half removed.
                 grave = self._work() / f"removed-{artefact.id}-{uuid.uuid4().hex[:8]}"
                 artefact.directory.chmod(0o755)
@@ -582,6 +699,8 @@ class Store:
             for path in work:
                 shutil.rmtree(path)
                 (self._locks() / path.name).unlink(missing_ok=True)
+            for directory in (self.root, self._keys(), self._names()):
+                remove_leftovers(directory)
             return artefacts, work
 
 
@@ -595,15 +714,27 @@ def _recorded_command(directory: Path) -> str:
         return ""
 
 
-def _pointers_to(keys: Path, id16: str) -> list[Path]:
-    """The keys that lead to ``id16``, found without trusting its manifest."""
-    return [
-        path
-        for path in keys.iterdir()
-        if re.fullmatch(_KEY, path.name)
-        and path.is_file()
-        and path.read_bytes().strip() == id16.encode()
-    ]
+def _pointers(keys: Path) -> Iterator[tuple[Path, str]]:
+    """The claims, and the id that each leads to, without trusting any manifest."""
+    for path in keys.iterdir():
+        if re.fullmatch(_KEY, path.name) and path.is_file():
+            yield path, path.read_bytes().strip().decode("ascii", "replace")
+
+
+def _has_size(path: Path, size: int) -> bool:
+    try:
+        information = path.stat()
+    except OSError:
+        return False
+    return stat.S_ISREG(information.st_mode) and information.st_size == size
+
+
+def _older(path: Path, limit: float) -> bool:
+    """Whether ``path`` was last changed before ``limit`` [s since 1970]; what is gone was not."""
+    try:
+        return path.stat().st_mtime < limit
+    except FileNotFoundError:
+        return False
 
 
 def _entries(directory: Path) -> list[Path]:
@@ -628,6 +759,10 @@ def _output_problem(directory: Path, output: Output, quick: bool = False) -> str
         return f"{path} is reached through a symbolic link"
     if information.st_size != output.size:
         return f"{path} has {information.st_size} bytes instead of {output.size}"
-    if not quick and file_digest(path) != output.sha256:
+    try:
+        altered = not quick and file_digest(path) != output.sha256
+    except OSError as error:
+        return f"{path} cannot be read ({error.strerror})"
+    if altered:
         return f"{path} has other bytes than were published"
     return None

@@ -280,16 +280,16 @@ def ids(*artefacts: Artefact) -> set[str]:
 
 
 def test_ancestors_are_found_by_content(empty_store, family):
-    found = empty_store.ancestors(family["airl"])
+    found = empty_store.index().parents(family["airl"])
     assert {role: [a.id for a in made] for role, made in found.items()} == {
         "demos": [family["demos"].id]
     }
-    assert empty_store.ancestors(family["expert"]) == {}
+    assert empty_store.index().parents(family["expert"]) == {}
 
 
 def test_ancestor_that_is_not_in_the_store(empty_store, publish):
     orphan = publish(empty_store, inputs={"reward": "0" * 64}).artefact
-    assert empty_store.ancestors(orphan) == {"reward": []}
+    assert empty_store.index().parents(orphan) == {"reward": []}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,174 @@
+"""Where a result came from: attempts, code, libraries; and the header of a checkpoint, which
+carries the attempts from one process to the next."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+SCHEMA = 1
+_LIBRARIES = (
+    "torch",
+    "numpy",
+    "scipy",
+    "stable-baselines3",
+    "gymnasium",
+    "Box2D",
+    "pybullet",
+    "pyarrow",
+    "msgspec",
+    "matplotlib",
+)
+
+
+class Attempt(msgspec.Struct, frozen=True, kw_only=True):
+    """One process's part in a result: when it began [UTC], how long it worked [s], by which code.
+
+    ``dirty`` is a digest of what was not committed; None if nothing, or if there is no git.
+    """
+
+    started: str
+    seconds: float
+    commit: str | None
+    dirty: str | None
+
+
+class Header(msgspec.Struct, frozen=True, kw_only=True):
+    """What a checkpoint says of itself."""
+
+    schema: int
+    stage: str
+    stage_version: int
+    libraries: dict[str, str | None]
+    attempts: tuple[Attempt, ...]
+
+    def encode(self, state: bytes) -> bytes:
+        """The header and a stage's ``state`` as the bytes of a checkpoint."""
+        head = msgspec.json.encode(self)
+        return len(head).to_bytes(4, "big") + head + state
+
+
+def decode(data: bytes, stage: str, stage_version: int) -> tuple[Header, bytes]:
+    """The header and the state of a checkpoint, if this program can go on from it.
+
+    Raises:
+        ValueError: of another schema, stage, version or libraries; or no checkpoint at all.
+    """
+    end = 4 + int.from_bytes(data[:4], "big")
+    try:
+        schema = msgspec.json.decode(data[4:end], type=_Schema).schema
+        header = msgspec.json.decode(data[4:end], type=Header) if schema == SCHEMA else None
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        raise ValueError("its header is not readable") from None
+    if header is None:
+        raise ValueError(f"it has schema {schema}, {SCHEMA} is the one known here")
+    if (header.stage, header.stage_version) != (stage, stage_version):
+        raise ValueError(
+            f"{header.stage} {header.stage_version} wrote it, this is {stage} {stage_version}"
+        )
+    present = libraries()
+    differing = [
+        f"{name} {header.libraries.get(name)} (now {present.get(name)})"
+        for name in sorted({*present, *header.libraries})
+        if header.libraries.get(name) != present.get(name)
+    ]
+    if differing:
+        raise ValueError(f"it was written with {', '.join(differing)}")
+    return header, data[end:]
+
+
+class _Schema(msgspec.Struct):
+    schema: int
+
+
+class Clock:
+    """The attempt of this process, from its construction on."""
+
+    def __init__(self):
+        self._started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        # Not the time of day, which may be set back.
+        self._begin = time.monotonic()
+        self._git = git_state(Path(__file__).parent)
+
+    def attempt(self) -> Attempt:
+        """The attempt as it stands."""
+        seconds = round(time.monotonic() - self._begin, 3)
+        return Attempt(started=self._started, seconds=seconds, **self._git)
+
+
+@functools.cache
+def libraries() -> dict[str, str | None]:
+    """Versions of what a result is computed with; None for a library that is not installed."""
+    # Imported here and below: a hit does without, and they take longer than it does.
+    import platform
+
+    found = {name: _version(name) for name in ("irlcli", *_LIBRARIES)}
+    return {**found, "python": platform.python_version()}
+
+
+def record(command: list[str], workers: int, attempts: tuple[Attempt, ...]) -> dict[str, Any]:
+    """The provenance of a result that ``attempts`` led to, the last of them just now."""
+    import platform
+
+    last = attempts[-1]
+    return {
+        "command": command,
+        "git": {"commit": last.commit, "dirty": last.dirty},
+        "libraries": libraries(),
+        "platform": platform.platform(),
+        "device": "cpu",
+        "workers": workers,
+        "started": attempts[0].started,
+        "seconds": round(sum(a.seconds for a in attempts), 3),
+        "attempts": msgspec.to_builtins(attempts),
+        "resumed": len(attempts) - 1,
+    }
+
+
+def _version(library: str) -> str | None:
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def git_state(package: Path) -> dict[str, str | None]:
+    """Commit of the checkout that ``package`` lies in, and a digest of what is not committed.
+
+    Changes and new files inside the package count, ignored files do not.
+    """
+    import shutil
+    import subprocess
+
+    unknown: dict[str, str | None] = {"commit": None, "dirty": None}
+    if shutil.which("git") is None:
+        return unknown
+
+    def git(*arguments: str) -> bytes | None:
+        done = subprocess.run(
+            ["git", "-C", str(package), *arguments],
+            capture_output=True,
+            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
+        )
+        return done.stdout if done.returncode == 0 else None
+
+    commit = git("rev-parse", "HEAD")
+    if commit is None or git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return unknown
+    changes = git("diff", "HEAD", "--", ".")
+    new = git("ls-files", "--others", "--exclude-standard", "-z", "--", ".")
+    if changes is None or new is None:
+        return unknown
+    for name in sorted(filter(None, new.split(b"\0"))):
+        content = hashlib.sha256((package / os.fsdecode(name)).read_bytes()).hexdigest()
+        changes += b"new file " + name + b" " + content.encode() + b"\n"
+    dirty = hashlib.sha256(changes).hexdigest()[:16] if changes else None
+    return {"commit": commit.decode().strip(), "dirty": dirty}

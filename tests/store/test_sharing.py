@@ -1,0 +1,341 @@
+"""What processes that share a store owe each other: claims, collection, and newer versions."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from irlcli.errors import Busy, IntegrityError, NotFound
+from irlcli.store import KeyRecord, Store
+from irlcli.store import store as store_module
+
+DAY = 86400.0
+
+
+def to_newer_schema(directory: Path) -> None:
+    """As a later version might write it: another schema, another form, the same way of naming."""
+    path = directory / "manifest.json"
+    path.chmod(0o644)
+    old = json.loads(path.read_bytes())
+    path.write_text(json.dumps({"schema": 2, "made_from": list(old["inputs"].values())}))
+
+
+@pytest.fixture
+def mixed(empty_store, publish):
+    """expert -> demos (named, of a newer schema), and a lonely one; all a year old."""
+    expert = publish(empty_store, {"f": b"expert"}, parameters={"of": "expert"}).artefact
+    inputs = {"expert": expert.output("f").sha256}
+    demos = publish(empty_store, {"f": b"demos"}, parameters={"of": "demos"}, inputs=inputs)
+    lonely = publish(empty_store, {"f": b"lonely"}, parameters={"of": "lonely"}).artefact
+    empty_store.set_name("best", demos.artefact)
+    to_newer_schema(demos.artefact.directory)
+    for artefact in (expert, demos.artefact, lonely):
+        os.utime(artefact.directory, (time.time() - 365 * DAY,) * 2)
+    return expert.id, demos.artefact.id, lonely.id
+
+
+def test_a_newer_schema_is_left_out_by_name(irl, empty_store, mixed):
+    expert, newer, lonely = mixed
+    root = empty_store.root
+    for arguments in (["ls"], ["gc", "--grace-days", "0"], ["lineage", lonely], ["verify"]):
+        result = irl(*arguments, "--store", root)
+        assert result.code == 0, result.err
+        warnings = [line for line in result.err.splitlines() if line.startswith("warning: ")]
+        assert len(warnings) == 1 and newer in warnings[0] and "upgrade" in warnings[0]
+        assert newer not in result.out and "damaged" not in result.err
+    assert irl("verify", "--store", root).out == "2 artefacts verified\n"
+    assert irl("show", newer, "--store", root).code == 4
+    listed = json.loads(irl("ls", "--json", "--store", root).out)
+    assert listed["newer"] == [newer]
+    assert {a["id"] for a in listed["artefacts"]} == {expert, lonely}
+    checked = json.loads(irl("verify", "--json", "--store", root).out)
+    assert (checked["checked"], checked["newer"], checked["damaged"]) == (2, [newer], {})
+    assert list((root / ".quarantine").iterdir()) == []
+
+
+def test_gc_keeps_what_a_newer_version_made_and_made_use_of(irl, empty_store, mixed):
+    expert, newer, _ = mixed
+    result = irl("gc", "--delete", "--grace-days", "0", "--store", empty_store.root)
+    assert result.code == 0, result.err
+    assert set(empty_store.ids()) == {expert, newer}
+    (empty_store.root / ".names" / "best").unlink()  # neither does it need a name
+    with pytest.warns(UserWarning, match="schema 2"):
+        assert empty_store.collect(0.0) == ([], [])
+
+
+def test_verify_says_in_json_what_is_damaged(irl, empty_store, publish):
+    artefact = publish(empty_store).artefact
+    sound = publish(empty_store, parameters={"seed": 1}).artefact
+    path = artefact.directory / "reward.pt"
+    path.chmod(0o644)
+    path.write_bytes(b"x" * path.stat().st_size)
+    result = irl("verify", "--json", "--store", empty_store.root)
+    assert result.code == 4
+    said = json.loads(result.out)
+    assert (said["kind"], said["exit_code"], said["checked"]) == ("error", 4, 2)
+    assert list(said["damaged"]) == [artefact.id] and sound.id not in result.out
+    damage = said["damaged"][artefact.id]
+    assert "reward.pt" in damage["problems"][0] and "other bytes" in damage["problems"][0]
+    assert damage["command"] == "irl train-airl"
+    assert Path(damage["quarantine"], "reward.pt").exists()
+
+
+def manifests_read(monkeypatch) -> list[str]:
+    read = []
+    original = store_module.read_manifest
+
+    def counting(directory):
+        read.append(directory.name)
+        return original(directory)
+
+    monkeypatch.setattr(store_module, "read_manifest", counting)
+    return read
+
+
+@pytest.mark.parametrize("text", ["ls", "gc", "gc --delete", "lineage REF"])
+def test_each_manifest_is_read_once(irl, empty_store, publish, monkeypatch, text):
+    """Or once more for the artefact that is named on the command line."""
+    parent = None
+    for seed in range(12):
+        inputs = {} if parent is None else {"reward": parent.output("f").sha256}
+        files = {"f": b"%d" % seed}
+        parent = publish(empty_store, files, parameters={"seed": seed}, inputs=inputs).artefact
+    empty_store.set_name("last", parent)
+    read = manifests_read(monkeypatch)
+    arguments = [parent.id if word == "REF" else word for word in text.split()]
+    result = irl(*arguments, "--store", empty_store.root)
+    assert result.code == 0, result.err
+    named = [parent.id] if "REF" in text else []
+    assert sorted(read) == sorted([*empty_store.ids(), *named])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lineage_ends_where_content_leads_back(irl, empty_store, publish, seed):
+    """Whichever of the two comes first in the order of the ids."""
+    first = publish(empty_store, {"f": b"same"}, parameters={"seed": seed}).artefact
+    inputs = {"reward": first.output("f").sha256}
+    second = publish(
+        empty_store, {"f": b"same", "g": b"x"}, parameters={"seed": seed}, inputs=inputs
+    ).artefact
+    result = irl("lineage", second.id, "--json", "--store", empty_store.root)
+    assert result.code == 0, result.err
+    (parent,) = json.loads(result.out)["inputs"]
+    assert parent["from"]["id"] == first.id
+
+
+# Claims
+
+RECORD = KeyRecord("train-airl", 1, {"seed": 0}, {})
+
+
+def staged(store: Store, name: str, data: bytes) -> Path:
+    output = store.root / ".work" / RECORD.key / name
+    output.mkdir(parents=True)
+    (output / "f").write_bytes(data)
+    return output
+
+
+def test_a_claim_that_leads_nowhere_is_replaced_and_a_valid_one_never(empty_store, monkeypatch):
+    """Between the look at a stale claim and its removal, another process makes a valid one."""
+    store = empty_store
+    pointer = store.root / ".keys" / RECORD.key
+    pointer.write_text("0" * 16)
+    output = staged(store, "slow", b"slow")
+    rival = None
+    original = Store._repairing
+
+    def interrupted(self):
+        nonlocal rival
+        monkeypatch.setattr(Store, "_repairing", original)
+        rival = Store(store.root).publish(RECORD, staged(store, "fast", b"fast"), {})
+        return original(self)
+
+    monkeypatch.setattr(Store, "_repairing", interrupted)
+    slow = store.publish(RECORD, output, {})
+    assert rival is not None and rival.diverged is None
+    assert slow.diverged == rival.artefact
+    assert store.find(RECORD.key) == rival.artefact
+    assert len(store.ids()) == 2
+
+
+def test_a_damaged_holder_gives_up_its_claim(empty_store):
+    """The work just done is published, not thrown away with an error."""
+    store = empty_store
+    holder = store.publish(RECORD, staged(store, "one", b"one"), {}).artefact
+    (holder.directory / "f").unlink()
+    second = store.publish(RECORD, staged(store, "two", b"two"), {})
+    assert second.diverged is None
+    assert store.find(RECORD.key) == second.artefact
+    assert len(list((store.root / ".quarantine").iterdir())) == 1
+
+
+def test_what_was_repaired_meanwhile_is_not_set_aside(empty_store, publish, monkeypatch):
+    """Damage is seen; before it is moved, another process has put sound bytes in its place."""
+    store = empty_store
+    artefact = publish(store).artefact
+    path = artefact.directory / "reward.pt"
+    path.chmod(0o644)
+    path.write_bytes(b"x" * path.stat().st_size)
+    original = Store._repairing
+
+    def interrupted(self):
+        monkeypatch.setattr(Store, "_repairing", original)
+        Store(store.root).verify([artefact.id])
+        publish(Store(store.root))
+        return original(self)
+
+    monkeypatch.setattr(Store, "_repairing", interrupted)
+    with pytest.raises(Busy, match="repaired"):
+        store.open(artefact, "reward.pt")
+    assert store.ids() == [artefact.id] and store.verify([artefact.id]) == {}
+
+
+def test_what_is_gone_is_not_called_damaged(empty_store, publish):
+    artefact = publish(empty_store).artefact
+    while empty_store.ids():
+        empty_store.collect(0.0)
+    with pytest.raises(NotFound, match="gone"):
+        empty_store.open(artefact, "reward.pt")
+    with pytest.raises(NotFound, match="gone"):
+        empty_store.get(artefact.id)
+    assert empty_store.find(artefact.manifest.record.key) is None
+
+
+# Collection
+
+
+def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monkeypatch):
+    artefact = publish(empty_store).artefact
+    with empty_store.working_on("0" * 64, wait=False) as scratch:
+        scratch.save(b"state")
+    original = store_module._older
+
+    def vanishing(path, limit):
+        if path.name == artefact.id:
+            path.chmod(0o755)
+            path.rename(empty_store.root / ".quarantine" / "x")
+        else:
+            scratch.clear()
+        return original(path, limit)
+
+    monkeypatch.setattr(store_module, "_older", vanishing)
+    assert empty_store.garbage(-1.0) == []
+    assert empty_store.stale_work(-1.0) == []
+
+
+@pytest.mark.parametrize("text", ["name {id} kept", "ls", "show {id}", "HIT --name kept"])
+def test_nothing_is_collected_while_a_command_uses_it(irl, store_copy, monkeypatch, text):
+    """gc asks at the last moment before the command ends."""
+    from irlcli import console
+
+    store = Store(store_copy.path)
+    for name in (store_copy.path / ".names").iterdir():
+        name.unlink()
+    if text.startswith("HIT"):
+        text = f"transfer --reward {store_copy.airl} --ood 1.5x --profile smoke --name kept"
+    asked = []
+    original = console.print_data
+
+    def collecting(line):
+        with pytest.raises(Busy):
+            store.collect(0.0)
+        asked.append(line)
+        original(line)
+
+    set_name = Store.set_name
+
+    def naming(self, name, artefact):
+        with pytest.raises(Busy):
+            store.collect(0.0)
+        set_name(self, name, artefact)
+
+    monkeypatch.setattr(console, "print_data", collecting)
+    monkeypatch.setattr(Store, "set_name", naming)
+    line = text.format(id=store_copy.transfer).split()
+    result = irl(*line, "--store", store_copy.path)
+    assert result.code == 0, result.err
+    assert asked and store_copy.transfer in store.ids()
+    if "kept" in text:
+        store.collect(0.0)
+        assert store_copy.transfer in store.ids() and store_copy.expert in store.ids()
+
+
+def test_a_command_waits_for_gc_to_end(irl, empty_store, publish):
+    artefact = publish(empty_store).artefact
+    ready, done = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        from irlcli.store.lock import locked
+
+        with locked(empty_store.root / ".locks" / "gc"):
+            os.write(done, b"x")
+            time.sleep(1.0)
+        os._exit(0)
+    os.read(ready, 1)
+    try:
+        result = irl("show", artefact.id, "--store", empty_store.root)
+    finally:
+        os.waitpid(pid, 0)
+    assert result.code == 0
+    assert f"WAIT the store: process {pid}" in result.err
+
+
+def test_what_killed_processes_left_is_cleared_away(empty_store, publish):
+    """Temporary files of every kind, of a process that was killed while it wrote them."""
+    key = "0" * 64
+    pid = os.fork()
+    if pid == 0:
+        from irlcli.store import scratch
+
+        def killed(*_):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        artefact = publish(empty_store).artefact
+        with empty_store.working_on(key, wait=False) as place:
+            place.save(b"first")
+            place.new_output()
+            scratch.os.replace = killed
+            place.save(b"second")
+        empty_store.set_name("best", artefact)
+    assert os.WTERMSIG(os.waitpid(pid, 0)[1]) == signal.SIGKILL
+    work = empty_store.root / ".work" / key
+    assert len(list(work.iterdir())) == 3
+    with empty_store.working_on(key, wait=False) as place:
+        assert place.load() == b"first"
+        output = place.new_output()
+        assert sorted(p.name for p in work.iterdir()) == sorted(["checkpoint", output.name])
+        output.rmdir()
+        place.clear()
+    assert not work.exists()
+
+
+def test_integrity_errors_of_a_store_without_its_empty_directories(empty_store, publish):
+    """A copy made by a program that leaves out empty directories is still a store."""
+    artefact = publish(empty_store).artefact
+    (empty_store.root / ".quarantine").rmdir()
+    (artefact.directory / "reward.pt").unlink()
+    with pytest.raises(IntegrityError, match="damaged"):
+        Store(empty_store.root).find(artefact.manifest.record.key)
+    assert len(list((empty_store.root / ".quarantine").iterdir())) == 1
+
+
+@pytest.mark.parametrize("call", ["file_digest", "read_provenance", "_entries"])
+def test_verify_survives_what_disappears_while_it_is_read(empty_store, publish, monkeypatch, call):
+    """Another process collects the artefact between two looks at it: gone is not damaged."""
+    artefact = publish(empty_store).artefact
+    original = getattr(store_module, call)
+
+    def vanishing(*arguments):
+        if artefact.directory.exists():
+            artefact.directory.chmod(0o755)
+            artefact.directory.rename(empty_store.root / ".work" / "x")
+        return original(*arguments)
+
+    monkeypatch.setattr(store_module, call, vanishing)
+    assert empty_store.verify([artefact.id]) == {}
+    assert list((empty_store.root / ".quarantine").iterdir()) == []

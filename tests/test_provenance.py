@@ -1,0 +1,217 @@
+"""Attempts, versions and code state: what a result and a checkpoint say of where they come from."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from typing import Any
+
+import msgspec
+import pytest
+import torch
+
+from irlcli import checkpoints, provenance
+from irlcli.runner import Runner, Silent
+from irlcli.stages import Job, Request, Stage
+from irlcli.stages.policy_training import _state
+from irlcli.store import Store
+
+ROUNDS = 4
+
+
+class Parameters(msgspec.Struct, frozen=True):
+    """Of a stage that only counts."""
+
+    rounds: int = ROUNDS
+
+
+class Died(Exception):
+    """In place of a power cut."""
+
+
+class Warned(Silent):
+    """A console that remembers warnings."""
+
+    def __init__(self):
+        self.warnings: list[str] = []
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+
+
+def counting(dies_after: int = ROUNDS + 1, version: int = 1) -> Request:
+    """A stage of four rounds of at least 20 ms that dies after some of them."""
+
+    def run(job: Job) -> None:
+        first = int(job.checkpoints.load() or b"0")
+        for done in range(first + 1, job.parameters.rounds + 1):
+            time.sleep(0.02)
+            job.checkpoints.offer(lambda done=done: b"%d" % done)
+            if done == dies_after:
+                raise Died
+        (job.output / "count").write_bytes(b"%d" % first)
+
+    return Request(Stage("count", version, run), Parameters(), {}, "count")
+
+
+def attempt(root, request: Request) -> tuple[Any, list[str]]:
+    console = Warned()
+    return Runner(root, console, checkpoint_seconds=0.0).run(request), console.warnings
+
+
+def die(root, after: int) -> None:
+    with pytest.raises(Died):
+        attempt(root, counting(after))
+
+
+def test_every_attempt_is_kept_with_its_seconds_and_its_code(tmp_path, monkeypatch):
+    for after, commit in ((1, "aaa"), (3, "bbb")):
+        monkeypatch.setattr(
+            provenance, "git_state", lambda _, c=commit: {"commit": c, "dirty": f"dirty {c}"}
+        )
+        die(tmp_path, after)
+    monkeypatch.setattr(provenance, "git_state", lambda _: {"commit": "ccc", "dirty": None})
+    artefact, warnings = attempt(tmp_path, counting())
+    assert warnings == [] and (artefact.directory / "count").read_bytes() == b"3"
+    origin = artefact.provenance()
+    attempts = origin["attempts"]
+    assert [(a["commit"], a["dirty"]) for a in attempts] == [
+        ("aaa", "dirty aaa"),
+        ("bbb", "dirty bbb"),
+        ("ccc", None),
+    ]
+    # One, two and one rounds: the time of each up to its last checkpoint, which is what it gave.
+    for item, rounds in zip(attempts, (1, 2, 1), strict=True):
+        assert item["seconds"] >= 0.02 * rounds
+    assert origin["seconds"] == pytest.approx(sum(a["seconds"] for a in attempts), abs=1e-3)
+    assert origin["resumed"] == 2 and origin["started"] == attempts[0]["started"]
+    assert origin["git"] == {"commit": "ccc", "dirty": None}
+
+
+def test_the_time_of_day_has_no_part_in_durations(tmp_path, monkeypatch):
+    """The clock is set back while the stage runs, here at every look."""
+    now = time.time()
+    moments = iter(range(10**6))
+    monkeypatch.setattr(time, "time", lambda: now - 3600.0 * next(moments))
+    artefact, _ = attempt(tmp_path, counting())
+    assert 0.08 <= artefact.provenance()["seconds"] < 60.0
+
+
+@pytest.mark.parametrize(
+    ("name", "now", "named"),
+    [
+        ("torch", "0.1", "torch 9.9 (now 0.1)"),
+        ("torch", None, "torch 9.9 (now None)"),
+        ("python", "4.0", "python 9.9 (now 4.0)"),
+    ],
+)
+def test_other_libraries_start_over_and_say_so(tmp_path, monkeypatch, name, now, named):
+    real = provenance.libraries()
+    monkeypatch.setattr(provenance, "libraries", lambda: {**real, name: "9.9"})
+    die(tmp_path, 2)
+    monkeypatch.setattr(provenance, "libraries", lambda: {**real, name: now})
+    artefact, warnings = attempt(tmp_path, counting())
+    assert (artefact.directory / "count").read_bytes() == b"0"
+    assert len(warnings) == 1 and named in warnings[0] and "starting over" in warnings[0]
+    # What was thrown away is no part of the result.
+    assert len(artefact.provenance()["attempts"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"schema": 2}, "schema 2"),
+        ({"schema": "1"}, "not readable"),
+        ({"stage": "other"}, "other 1 wrote it"),
+        ({"stage_version": 7}, "count 7 wrote it"),
+        ({"attempts": [{"started": 1}]}, "not readable"),
+        ({"libraries": {}}, "written with"),
+        (None, "not readable"),
+    ],
+)
+def test_headers_that_cannot_be_used(tmp_path, change, named):
+    die(tmp_path, 2)
+    (path,) = tmp_path.glob(".work/*/checkpoint")
+    with Store(tmp_path).working_on(path.parent.name, wait=False) as scratch:
+        stored = scratch.load()
+        end = 4 + int.from_bytes(stored[:4], "big")
+        assert json.loads(stored[4:end])["stage"] == "count"
+        if change is None:
+            scratch.save(b"2")  # as before there were headers
+        else:
+            head = json.dumps({**json.loads(stored[4:end]), **change}).encode()
+            scratch.save(len(head).to_bytes(4, "big") + head + stored[end:])
+    artefact, warnings = attempt(tmp_path, counting())
+    assert (artefact.directory / "count").read_bytes() == b"0"
+    assert len(warnings) == 1 and named in warnings[0] and "starting over" in warnings[0]
+
+
+def test_code_that_is_not_committed_counts_new_files_too(tmp_path):
+    def git(*arguments: str) -> str:
+        who = ("-c", "user.name=x", "-c", "user.email=x@y")
+        line = ["git", "-C", str(tmp_path), *who, *arguments]
+        return subprocess.run(line, check=True, capture_output=True, text=True).stdout.strip()
+
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (tmp_path / ".gitignore").write_text("__pycache__/\n")
+    assert provenance.git_state(package) == {"commit": None, "dirty": None}
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "x")
+    clean = {"commit": git("rev-parse", "HEAD"), "dirty": None}
+    assert provenance.git_state(package) == clean
+    (package / "__pycache__").mkdir()
+    (package / "__pycache__" / "x.pyc").write_bytes(b"x")
+    (tmp_path / "notes").write_text("outside the package")
+    assert provenance.git_state(package) == clean
+    states = []
+    for name, text in (("new.py", "1"), ("new.py", "2"), ("other.py", "2"), ("__init__.py", "3")):
+        (package / name).write_text(text)
+        states.append(provenance.git_state(package)["dirty"])
+    assert None not in states and len(set(states)) == 4
+
+
+class Trainer:
+    """As much of a trainer as a checkpoint asks for."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"steps": 1}
+
+
+def test_the_metrics_of_a_long_run_fit_into_its_checkpoint():
+    """Paper budgets of many settings and rounds: the index of a tensor file is capped at 4 MiB."""
+    row = {"round": 10**6, "setting": "mass=0.5x", "true_return": 1 / 3, "progress": float("nan")}
+    rows = [row] * 100_000
+    assert len(json.dumps(rows)) > 8 << 20
+    state = checkpoints.restore(_state(Trainer(), None, 7, rows), pytest.fail)
+    restored = json.loads(state["rows"].numpy().tobytes())
+    assert len(restored) == len(rows) and repr(restored[-1]) == repr(row)
+
+
+def test_a_checkpoint_larger_than_a_foreign_file_may_be_is_read():
+    """Nothing unpacks to more than was read, so its size alone is no reason to refuse it."""
+    state = {"past": torch.zeros((257 << 20) // 8, dtype=torch.float64)}
+    data = checkpoints.to_bytes(state)
+    del state
+    assert len(checkpoints.from_bytes(data)["past"]) == (257 << 20) // 8
+
+
+def test_running_out_of_memory_says_nothing_about_a_file(irl, store_copy, tmp_path, monkeypatch):
+    def exhausted(*_, **__):
+        raise MemoryError
+
+    data = checkpoints.to_bytes({"x": torch.zeros(3)})
+    monkeypatch.setattr(torch, "load", exhausted)
+    with pytest.raises(MemoryError):
+        checkpoints.from_bytes(data)
+    (tmp_path / "reward.pt").write_bytes(data)
+    result = irl(
+        *("transfer", "--reward", tmp_path / "reward.pt", "--ood", "2x"),
+        *("--store", store_copy.path),
+    )
+    assert result.code == 1
+    assert "error: out of memory" in result.err and "hint: " in result.err
+    assert "defect" not in result.err and "not a tensor file" not in result.err

@@ -1,0 +1,224 @@
+"""Many processes at once: the work is done once, nobody sees a part of an artefact, and what is
+in use is not collected.
+
+    python tests/torture/concurrency.py [--short]
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from harness import HERE, SMOKE, Child, figures, irl, must, preload, seeded, warm_up
+
+KEYS = 6
+FILES = {"reward.pt": 40_000, "nested/table.parquet": 9_000}
+
+
+def content(key: int, name: str) -> bytes:
+    return bytes([key]) * FILES[name]
+
+
+def asker(root: Path, seed: int, rounds: int) -> None:
+    """Ask for one artefact after the other, as the runner does; make what is not there."""
+    from irlcli.store import KeyRecord, Store
+
+    random = seeded()
+    random.seed(seed)
+    for _ in range(rounds):
+        store = Store(root)
+        key = random.randrange(KEYS)
+        record = KeyRecord("train-airl", 1, {"key": key}, {})
+        with store.in_use(wait=True):
+            found = store.find(record.key)
+            if found is None:
+                with store.working_on(record.key, wait=True) as scratch:
+                    found = store.find(record.key)
+                    if found is None:
+                        output = scratch.new_output()
+                        (output / "nested").mkdir()
+                        for name in FILES:
+                            (output / name).write_bytes(content(key, name))
+                        found = store.publish(record, output, {"command": ["irl"]}).artefact
+                        with open(root.parent / "made", "a") as log:
+                            log.write(f"{key}\n")
+            for name in FILES:
+                assert store.open(found, name).read_bytes() == content(key, name)
+            if key < 2 and random.random() < 0.2:
+                store.set_name(f"name-{key}", found)
+                assert store.resolve(f"name-{key}/reward.pt").artefact == found
+        # gc needs a moment in which nobody holds the store.
+        time.sleep(random.expovariate(1 / 0.05))
+
+
+def until_told(work: Callable[[], None], root: Path) -> None:
+    while not (root.parent / "stop").exists():
+        work()
+
+
+def collector(root: Path) -> None:
+    from irlcli.errors import Busy
+    from irlcli.store import Store
+
+    def work() -> None:
+        try:
+            removed, _ = Store(root).collect(0.0)
+        except Busy:
+            return
+        with open(root.parent / "collected", "a") as log:
+            log.write("".join(f"{a.manifest.record.parameters['key']}\n" for a in removed))
+        time.sleep(0.01)
+
+    until_told(work, root)
+
+
+def checker(root: Path) -> None:
+    """Reads everything all the time; whatever it sees must be whole."""
+    from irlcli.store import Store
+
+    def work() -> None:
+        store = Store(root)
+        with store.in_use(wait=True):
+            assert store.verify(store.ids()) == {}
+            index = store.index()
+            for name in store.names().values():
+                assert name in index.artefacts
+        # A dry run of gc, and a verify, of somebody who does not know of the lock.
+        store.garbage(0.0)
+        store.stale_work(0.0)
+        assert store.verify(store.ids()) == {}
+        time.sleep(0.05)
+
+    until_told(work, root)
+
+
+def fork(work: Callable[[], None]) -> int:
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            work()
+            code = 0
+        except BaseException:
+            import traceback
+
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    return pid
+
+
+def store_alone(work: Path, rounds: int) -> dict[str, int]:
+    """Eight askers, two collectors, two checkers on one store."""
+    from irlcli.store import Store
+
+    root = work / "runs"
+    Store(root).create()
+    others = [fork(lambda: collector(root)) for _ in range(2)]
+    others += [fork(lambda: checker(root)) for _ in range(2)]
+    askers = [fork(lambda seed=seed: asker(root, seed, rounds)) for seed in range(8)]
+    assert [os.waitpid(pid, 0)[1] for pid in askers] == [0] * 8
+    (work / "stop").touch()
+    assert [os.waitpid(pid, 0)[1] for pid in others] == [0] * 4
+    made = Counter((work / "made").read_text().split())
+    collected = Counter((work / "collected").read_text().split())
+    for key, count in made.items():
+        # Made once, and once more for each time that it was collected.
+        assert count - collected[key] in (0, 1), (key, made, collected)
+    store = Store(root)
+    assert store.verify(store.ids()) == {}
+    assert list((root / ".quarantine").iterdir()) == []
+    return {
+        "requests": 8 * rounds,
+        "artefacts made": made.total(),
+        "artefacts collected": collected.total(),
+        "artefacts at the end": len(store.ids()),
+    }
+
+
+def commands_at_once(work: Path, processes: int) -> dict[str, int]:
+    """The same chain and overlapping ones through the command line, with gc and verify beside."""
+    from irlcli.store import Store
+
+    root = work / "commands"
+    lander = ["--env", "lunar-lander", "--set", "expert.total_steps=2048"]
+    lines = [
+        ["collect-experts", *lander, "--intervention", "bounce=0.1,0.5"],
+        ["collect-experts", *lander, "--intervention", "bounce=0.5,0.9"],
+        ["evaluate", "--expert", *lander, "--ood", "bounce=0.9", "--episodes", "1"],
+        ["collect-experts", *lander, "--intervention", "bounce=0.1,0.5"],
+    ]
+    smoke = [argument for argument in SMOKE if argument != "--quiet"]
+    children = [
+        Child(root, [*lines[i % len(lines)], *smoke, "--name", f"name-{i}"])
+        for i in range(processes)
+    ]
+    beside = 0
+    while not all(child.ended() for child in children):
+        collected = irl(root, "gc", "--delete", "--grace-days", "0")
+        assert collected.code in (0, 75), collected.err
+        must(irl(root, "verify"))
+        must(irl(root, "ls", "--json"))
+        beside += 1
+    ended = [must(child.wait()) for child in children]
+    runs = Counter(label for e in ended for label in re.findall(r"^RUN (.*)$", e.err, re.M))
+    # Three experts, two datasets, one evaluation: each was made by one process only.
+    assert len(runs) == 6 and set(runs.values()) == {1}, runs
+    assert len(set(ended[0].out.split() + ended[3].out.split())) == 1
+    must(irl(root, "gc", "--delete", "--grace-days", "0"))
+    store = Store(root)
+    assert len(store.ids()) == 6 and store.verify(store.ids()) == {}
+    return {"processes": processes, "stages run": runs.total(), "gc, verify and ls beside": beside}
+
+
+def table_row(work: Path) -> dict[str, int]:
+    """`make -j8` of a row of Table 1 on a fresh store, twice; the second time nothing is made."""
+    from irlcli.store import Store
+
+    root = work / "row"
+    line = [
+        *("make", "-j8", "--no-print-directory", "-C", str(HERE.parent.parent), "row-engine-power"),
+        *(f"STORE={root}", "PROFILE=smoke", "SEEDS=0", "METHODS=erm irm"),
+        *("READY=Makefile", f"IRL={sys.executable} -m irlcli"),
+    ]
+    environment = {**os.environ, "LD_PRELOAD": "", "PYTHONPATH": str(HERE.parent.parent)}
+    before: list[str] = []
+    for _ in range(2):
+        done = subprocess.run(line, capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr
+        store = Store(root)
+        assert store.verify(store.ids()) == {}
+        assert before in ([], store.ids())
+        before = store.ids()
+    assert "RUN " not in done.stderr
+    return {"artefacts of a row": len(before)}
+
+
+def main() -> None:
+    short = "--short" in sys.argv
+    preload()
+    signal.alarm(300 if short else 3600)  # a deadlock is a failure, too
+    if not short:
+        warm_up()
+    with tempfile.TemporaryDirectory(prefix="irl-torture-") as name:
+        work = Path(name)
+        begin = time.monotonic()
+        figures("concurrency", store_alone(work, 100 if short else 1000))
+        if not short:
+            figures("concurrency", commands_at_once(work, 8))
+            if shutil.which("make") is not None:
+                figures("concurrency", table_row(work))
+        figures("concurrency", {"seconds": round(time.monotonic() - begin)})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Kill, refuse, fill the disk, set the clock back: the store stays whole, and a rerun ends in the
+same bytes.
+
+    python tests/torture/crash.py [--short]
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from harness import Chain, Child, Fault, command, figures, irl, must, preload, seeded, warm_up
+
+CHEAP = ("grid", "train-maxent")
+_ENOUGH = 2000  # calls; far more than one stage makes
+_YEAR = 365 * 86400
+
+
+def killed_at_every_call(chain: Chain, stage: str, work: Path, stride: int) -> int:
+    """SIGKILL at every ``stride``-th call that changes a file; returns the number of kills.
+
+    The rerun of each is killed, too, half as far on, and the one after that goes to the end.
+    """
+    kills = 0
+    for n in range(0, _ENOUGH, stride):
+        store = chain.fresh(stage, work / "store")
+        ended = irl(store, *command(stage), fault=Fault(n))
+        if ended.code == 0:
+            assert n > 30, "calls were not intercepted"
+            return kills
+        again = irl(store, *command(stage), fault=Fault(n // 2))
+        for killed in (ended, again):
+            assert killed.code in (0, -signal.SIGKILL), killed
+            kills += killed.code != 0
+        chain.assert_sound(stage, store)
+        chain.assert_completes(stage, store)
+        print(f"crash: {stage}: {kills} kills", file=sys.stderr, flush=True)
+    raise AssertionError(f"{stage} never completed")
+
+
+def killed_at_random(chain: Chain, stage: str, work: Path, wanted: int) -> tuple[int, int]:
+    """SIGKILL at random times, several in a row; returns kills and completed runs."""
+    random = seeded()
+    kills = runs = 0
+    while kills < wanted:
+        store = chain.fresh(stage, work / "store")
+        for _ in range(random.randint(1, 5)):
+            child = Child(store, command(stage))
+            time.sleep(random.uniform(0.0, 1.1 * chain.seconds[stage]))
+            if not child.ended():
+                child.kill()
+            ended = child.wait()
+            chain.assert_sound(stage, store)
+            if ended.code == 0:
+                break
+            assert ended.code == -signal.SIGKILL, ended
+            kills += 1
+        chain.assert_completes(stage, store)
+        runs += 1
+        print(f"crash: {stage}: {kills} kills", file=sys.stderr, flush=True)
+    return kills, runs
+
+
+def refused_calls(
+    chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool]
+) -> int:
+    """One kind of call fails, once at a place or from there on; returns how often one did."""
+    refused = 0
+    for call, number in (
+        ("fsync", errno.EIO),
+        ("rename", errno.EIO),
+        ("link", errno.EPERM),
+        ("write", errno.ENOSPC),
+        ("mkdir", errno.EDQUOT),
+        ("open", errno.EROFS),
+    ):
+        for persist in persists:
+            for n in range(0, _ENOUGH, stride):
+                store = chain.fresh(stage, work / "store")
+                fault = Fault(n, number, persist, (call,))
+                ended = irl(store, *command(stage), fault=fault)
+                chain.assert_sound(stage, store)
+                if ended.code == 0:
+                    break
+                must(ended, 1)
+                assert os.strerror(number) in ended.err and "hint: " in ended.err, ended.err
+                chain.assert_completes(stage, store)
+                refused += 1
+    assert refused >= 6
+    return refused
+
+
+def clock_set_back(chain: Chain, stage: str, work: Path) -> int:
+    """A run is killed, the clock goes back or forth by a year, and the run goes on."""
+    from irlcli.store import Store
+
+    for clock in (-_YEAR, _YEAR):
+        store = chain.fresh(stage, work / "store")
+        child = Child(store, command(stage))
+        while not child.ended() and not list(store.glob(".work/*/checkpoint")):
+            time.sleep(0.001)
+        if not child.ended():
+            child.kill()
+        child.wait()
+        must(irl(store, *command(stage), fault=Fault(clock=clock)))
+        chain.assert_sound(stage, store)
+        assert Store(store).ids() == chain.ids[stage]
+        for artefact in Store(store).artefacts():
+            origin = artefact.provenance()
+            assert origin["seconds"] >= 0 and all(a["seconds"] >= 0 for a in origin["attempts"])
+        # What seems to come from the future is young, whatever leads to it.
+        for name in (store / ".names").iterdir():
+            name.unlink()
+        if clock < 0:
+            fault = Fault(clock=clock)
+            must(irl(store, "gc", "--delete", "--grace-days", "0", fault=fault))
+            assert Store(store).ids() == chain.ids[stage]
+    return 2
+
+
+def full_disk(chain: Chain, stage: str, work: Path, stride: int) -> dict[str, int]:
+    """A file system of every size from nothing up to enough; then it gets larger.
+
+    Runs in a mount namespace of its own, where a tmpfs may be mounted.
+    """
+    place = work / "small"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "tmpfs", str(place)], check=True)
+    full = 0
+    needed = 0
+    inputs = sum(f.stat().st_size for f in chain.before[stage].rglob("*") if f.is_file()) >> 10
+    for pages in range(2, _ENOUGH, stride):
+        store = place / "store"
+        subprocess.run(["mount", "-o", "remount,size=1g", str(place)], check=True)
+        chain.fresh(stage, store)
+        used = shutil.disk_usage(place).used
+        size = used + pages * 4096
+        subprocess.run(["mount", "-o", f"remount,size={size}", str(place)], check=True)
+        ended = irl(store, *command(stage))
+        chain.assert_sound(stage, store)
+        if ended.code == 0:
+            needed = pages * 4
+            break
+        must(ended, 1)
+        assert os.strerror(errno.ENOSPC) in ended.err, ended.err
+        full += 1
+        subprocess.run(["mount", "-o", "remount,size=1g", str(place)], check=True)
+        chain.assert_completes(stage, store)
+    subprocess.run(["umount", str(place)], check=True)
+    assert full > 0 and needed > 0
+    return {"full disks": full, "KiB needed beside the inputs": needed, "KiB of inputs": inputs}
+
+
+def in_mount_namespace(script: Path, arguments: list[str]) -> subprocess.CompletedProcess | None:
+    """This script again where it may mount; None if the system does not allow that."""
+    unshare = ["unshare", "--mount", "--map-root-user", "--user"]
+    probe = [*unshare, "sh", "-c", "mount -t tmpfs tmpfs /tmp"]
+    if shutil.which("unshare") is None or subprocess.run(probe, capture_output=True).returncode:
+        return None
+    line = [*unshare, sys.executable, str(script), *arguments]
+    return subprocess.run(line, capture_output=True, text=True)
+
+
+def main() -> None:
+    short = "--short" in sys.argv
+    preload()
+    warm_up()
+    with tempfile.TemporaryDirectory(prefix="irl-torture-") as name:
+        work = Path(name)
+        if "--full-disk" in sys.argv:
+            figures("full disk", full_disk(Chain(work, CHEAP), "train-maxent", work, 2))
+            return
+        begin = time.monotonic()
+        chain = Chain(work, CHEAP) if short else Chain(work)
+        kills = 0
+        for stage in ("grid", "train-maxent") if not short else ("train-maxent",):
+            found = killed_at_every_call(chain, stage, work, 14 if short else 1)
+            kills += found
+            figures("crash", {f"{stage}: kills, one at every call": found})
+        for stage in chain.before if not short else ("train-maxent",):
+            found, runs = killed_at_random(chain, stage, work, 2 if short else 20)
+            kills += found
+            figures("crash", {f"{stage}: kills at random times": found, "completed runs": runs})
+        how = (25, (False,)) if short else (3, (False, True))
+        refused = refused_calls(chain, "train-maxent", work, *how)
+        clocks = clock_set_back(chain, "train-maxent", work)
+        disks = in_mount_namespace(Path(__file__), ["--full-disk"]) if not short else None
+        if disks is not None:
+            assert disks.returncode == 0, disks.stderr
+            print(disks.stdout, end="")
+        elif not short:
+            print("crash: full disk: left out, a tmpfs may not be mounted here")
+        figures(
+            "crash",
+            {
+                "kills": kills,
+                "refused calls": refused,
+                "clocks set": clocks,
+                "seconds": round(time.monotonic() - begin),
+            },
+        )
+
+
+if __name__ == "__main__":
+    main()
