@@ -4,9 +4,10 @@
 
 Rounds with one and with two workers alternate, so whatever else the machine does falls on both;
 *by the clock* is the median ratio of neighbouring rounds. It needs two idle cores. *By CPU time*
-needs none: every round takes the same steps, and of each step the least over the rounds of the
-parent's CPU time and of each worker's come nearest to an idle machine's. The parent sleeps while
-workers step, so a step lasts as long as the parent and its slowest worker together.
+needs none: every round takes the same steps, and of each step the least CPU time over the rounds,
+the parent's and each worker's, comes nearest to an idle machine's. The parent sleeps while workers
+step, so a step lasts as long as the parent and its slowest worker together. Beside heavy load even
+that is too high, since waking finds the caches cold.
 """
 
 from __future__ import annotations
