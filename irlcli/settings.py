@@ -5,6 +5,7 @@ environment's file, its profile, ``--settings FILE``, then flags and ``--set``. 
 variables never enter: equal settings give equal artefacts wherever they run.
 """
 
+import stat
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,9 @@ from irlcli.interventions import environment, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
 
+# A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
+_MAX_TOML_BYTES = 64 << 10
+_MAX_TOML_LINE = 2000
 # Bounded, so that every count fits 64 bits and no key holds an infinity or NaN.
 _MOST = 2**53
 _LARGE = 1e300
@@ -256,7 +260,13 @@ def _settings_directory() -> Path:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        information = path.stat()
+        if not stat.S_ISREG(information.st_mode) and not stat.S_ISDIR(information.st_mode):
+            # Opening a named pipe would wait for a writer that never comes.
+            raise UsageError(f"{path} is not a plain file", "name a TOML file with --settings")
+        if information.st_size > _MAX_TOML_BYTES:
+            raise ValueError(f"it is larger than {_MAX_TOML_BYTES >> 10} KiB")
+        return _parse_toml(path.read_text("utf-8"))
     except (ValueError, RecursionError) as error:
         raise UsageError(
             f"{path} is not valid TOML: {error}", "see settings/ for examples"
@@ -265,6 +275,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(
             f"{path} cannot be read: {error.strerror}", "name a TOML file with --settings"
         ) from None
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    if max(map(len, text.splitlines()), default=0) > _MAX_TOML_LINE:
+        raise ValueError(f"a line is longer than {_MAX_TOML_LINE} characters")
+    return tomllib.loads(text)
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -339,7 +355,7 @@ def _override(item: str) -> dict[str, Any]:
 
 def _typed(text: str, kind: Any, field: str) -> Any:
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        value = _parse_toml(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text
     try:

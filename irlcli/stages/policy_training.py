@@ -33,7 +33,8 @@ def train_rounds(
     first, rows = 0, []
     if adversary is not None:
         reward = adversary.reward
-    state = checkpoints.restore(job.checkpoints.load(), job.console.warn)
+    names = {"trainer", "adversary", "round", "rows"}
+    state = checkpoints.restore(job.checkpoints.load(), names, job.console.warn)
     if state is not None:
         trainer.load_state_dict(state["trainer"])
         if adversary is not None:
