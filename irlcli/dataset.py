@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ SCHEMA = 1
 STEPS = "steps.parquet"
 EPISODES = "episodes.parquet"
 _MAX_SETTING_LENGTH = 200
+_MAX_TEXT_BYTES = 1 << 20
 _METADATA_KEY = b"irlcli"
 # Far above any real dataset. A kilobyte of Parquet can stand for terabytes, so what a file
 # declares is read first.
@@ -220,10 +221,21 @@ def _opened(path: Path) -> pq.ParquetFile:
 def _declared_bytes(metadata: pq.FileMetaData, bytes_per_value: int) -> int:
     """What decoding takes if the footer is honest: unpacked pages, and so much for every value."""
     total = bytes_per_value * metadata.num_rows * metadata.num_columns
-    for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for column in map(group.column, range(group.num_columns)):
-            total += column.total_uncompressed_size + bytes_per_value * column.num_values
+    texts = sum(
+        column.total_uncompressed_size - _MAX_SETTING_LENGTH * column.num_values
+        for column in _chunks(metadata)
+        if column.physical_type == "BYTE_ARRAY"
+    )
+    if texts > _MAX_TEXT_BYTES:
+        raise ValueError(f"its texts take {texts:,} bytes")
+    for column in _chunks(metadata):
+        total += column.total_uncompressed_size + bytes_per_value * column.num_values
     return total
+
+
+def _chunks(metadata: pq.FileMetaData) -> Iterator[pq.ColumnChunkMetaData]:
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        yield from map(group.column, range(group.num_columns))
 
 
 def _check_schemas(steps: pa.Schema, episodes: pa.Schema) -> None:
