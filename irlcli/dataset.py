@@ -28,10 +28,11 @@ EPISODES = "episodes.parquet"
 _MAX_SETTING_LENGTH = 200
 _MAX_TEXT_BYTES = 1 << 20
 _METADATA_KEY = b"irlcli"
-# Far above any real dataset. A kilobyte of Parquet can stand for terabytes, so what a file
-# declares is read first.
-_MAX_FILE_BYTES = 2 << 30
+# A kilobyte of Parquet can stand for terabytes, so what a file declares is read first: refused is
+# more than 2 GiB that is also more than 100 times the file, which no recorded numbers are.
+_MAX_FILE_BYTES = 8 << 30
 _MAX_DECODED_BYTES = 2 << 30
+_MAX_RATIO = 100
 # A step is decoded to arrays, an episode to Python's objects.
 _BYTES_PER_VALUE = {STEPS: 8, EPISODES: 100}
 
@@ -210,11 +211,9 @@ def _opened(path: Path) -> pq.ParquetFile:
     texts = ["setting"] if path.name == EPISODES else []
     file = pq.ParquetFile(path, read_dictionary=texts, page_checksum_verification=True)
     declared = _declared_bytes(file.metadata, _BYTES_PER_VALUE[path.name])
-    if declared > _MAX_DECODED_BYTES:
+    if declared > max(_MAX_DECODED_BYTES, _MAX_RATIO * information.st_size):
         file.close()
-        raise ValueError(
-            f"it declares {declared:,} bytes, more than {_MAX_DECODED_BYTES >> 30} GiB"
-        )
+        raise ValueError(f"{information.st_size:,} bytes that declare {declared:,}")
     return file
 
 

@@ -46,8 +46,9 @@ PENALISED = ("irm", "irm-shuffled")
 class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """PPO (paper App. C names the values of rl-baselines3-zoo). ``linear`` falls to zero."""
 
-    n_envs: Count = 16
-    n_steps: Count = 1024
+    # Bounded, so that no file can ask for more worlds or steps than memory holds.
+    n_envs: Annotated[int, Meta(ge=1, le=1024)] = 16
+    n_steps: Annotated[int, Meta(ge=1, le=65536)] = 1024
     rollouts_per_round: Count = 1
     batch_size: Annotated[int, Meta(ge=2, le=_MOST)] = 512
     n_epochs: Count = 4
