@@ -471,6 +471,10 @@ def play(
         settings += [setting for setting in added if setting not in settings]
     if file.suffix.lower() != ".gif":
         raise UsageError(f"{str(file)!r} does not end in .gif", "a GIF is what can be written")
+    if not file.parent.is_dir():
+        raise UsageError(
+            f"{file.parent} is not a directory: {file} cannot be written there", "make it first"
+        )
 
     from irlcli.checkpoints import load_policy_file
     from irlcli.play import write_gif

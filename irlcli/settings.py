@@ -361,7 +361,8 @@ def _typed(text: str, kind: Any, field: str) -> Any:
         value = text
     try:
         return msgspec.to_builtins(msgspec.convert(value, kind))
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:
+        # Arguments may hold bytes that are no text.
         raise UsageError(
             f"--set {field}={text}: {str(error).partition(' - at ')[0]}", _field_hint(field)
         ) from None
