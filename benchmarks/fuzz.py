@@ -68,7 +68,7 @@ def overrides(place: Path) -> Target:
     from irlcli.settings import load_settings
 
     def read(data: bytes) -> None:
-        load_settings("lunar-lander", overrides=[data.decode("utf-8", "surrogateescape")])
+        load_settings("gridworld", overrides=[data.decode("utf-8", "surrogateescape")])
 
     seeds = [b"airl.penalty_weight=30", b"airl.hidden=[32, 32]", b"expert.ppo.activation=relu"]
     return Target(seeds, read)
@@ -79,7 +79,7 @@ def settings_files(place: Path) -> Target:
 
     def read(data: bytes) -> None:
         (place / "settings.toml").write_bytes(data)
-        load_settings("lunar-lander", file=place / "settings.toml")
+        load_settings("gridworld", file=place / "settings.toml")
 
     demo = Path(PACKAGE).parent / "settings" / "demo" / "lunar-lander.toml"
     seeds = [

@@ -15,9 +15,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from hypothesis import settings
 
 from irlcli import cli as command_line
 from irlcli.store import KeyRecord, Published, Store
+
+# How long an example takes depends on who else uses the machine.
+settings.register_profile("irlcli", deadline=None)
+settings.load_profile("irlcli")
 
 
 @dataclass(frozen=True)
