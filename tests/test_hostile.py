@@ -351,6 +351,32 @@ def test_checkpoints_of_another_stage_are_not_used():
         from_bytes(to_bytes({"x": Path("/")}))
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"trainer": {}},
+        {"trainer": []},
+        {"rows": "{"},
+        {"rows": 7},
+        {"round": "x"},
+        {"trainer": {"policy": {}, "optimizer": {}, "steps": 0}},
+    ],
+)
+def test_a_checkpoint_made_by_somebody_is_named(irl, store_copy, changes):
+    """Sound tensors and a sound checksum around a state that no stage wrote."""
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    (store.root / ".keys" / key).unlink()
+    state = {"trainer": {}, "adversary": {}, "round": 0, "rows": "[]", **changes}
+    with store.working_on(key, wait=False) as scratch:
+        scratch.save(bytes(4) + to_bytes(state))
+    done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
+    assert_refused((done.code, done.out, done.err), 4, key)
+    shutil.rmtree(store.root / ".work" / key)
+    again = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
+    assert Path(again.out.strip()).name == store_copy.transfer
+
+
 def planted(store: Store, source: str, name: str, data: bytes) -> None:
     """Put an artefact in ``source``'s place, sound by its digests, that says ``data`` in ``name``."""
     artefact = store.get(source)

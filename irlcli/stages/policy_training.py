@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from irlcli import checkpoints
+from irlcli.errors import IntegrityError
 from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
 from irlcli.stages import Job
 from irlcli.stages.adversary import Adversary
@@ -36,10 +37,7 @@ def train_rounds(
     names = {"trainer", "adversary", "round", "rows"}
     state = checkpoints.restore(job.checkpoints.load(), names, job.console.warn)
     if state is not None:
-        trainer.load_state_dict(state["trainer"])
-        if adversary is not None:
-            adversary.load_state_dict(state["adversary"])
-        first, rows = state["round"], json.loads(state["rows"])
+        first, rows = _resume(job, trainer, adversary, state)
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
         _warn(job, index, rollouts, settings)
@@ -53,6 +51,28 @@ def train_rounds(
         _report(job, trainer, newest)
         job.checkpoints.offer(partial(_state, trainer, adversary, index + 1, rows))
     return rows
+
+
+def _resume(
+    job: Job, trainer: PPOTrainer, adversary: Adversary | None, state: Row
+) -> tuple[int, list[Row]]:
+    """Number of rounds done and their rows; trainer and adversary go on from ``state``.
+
+    Raises:
+        IntegrityError: a state that somebody made, or another version of the program.
+    """
+    try:
+        trainer.load_state_dict(state["trainer"])
+        if adversary is not None:
+            adversary.load_state_dict(state["adversary"])
+        return int(state["round"]), list(json.loads(state["rows"]))
+    except Exception as error:
+        # Whatever a crafted state makes torch and Python raise.
+        raise IntegrityError(
+            f"the checkpoint in {job.output.parent} does not fit its stage "
+            f"({type(error).__name__})",
+            "remove that directory, then run the same command again to start over",
+        ) from None
 
 
 def _state(
