@@ -17,6 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -220,11 +221,11 @@ def declare_many_rows(directory: Path) -> None:
 
 
 def long_setting(directory: Path) -> None:
-    """A text of 64 MB in a few kilobytes."""
+    """A text of 8 MB in a few kilobytes."""
     path = directory / EPISODES
     table = pq.read_table(path)
     column = table.schema.get_field_index("setting")
-    texts = pa.array(["a" * (64 << 20)] * len(table))
+    texts = pa.array(["a" * (8 << 20)] * len(table))
     pq.write_table(
         table.set_column(column, table.schema.field(column), texts), path, compression="zstd"
     )
@@ -242,11 +243,11 @@ def nested(directory: Path) -> None:
 
 
 def one_wide_row(directory: Path) -> None:
-    """A list of 40 million numbers in one cell."""
+    """A list of 22 million numbers in one cell."""
     path = directory / EPISODES
     table = pq.read_table(path)
     column = table.schema.get_field_index("intervention")
-    values = pa.array([0.0]).take(pa.array([0] * 40_000_000, pa.int32()))
+    values = pa.array(np.zeros(22_000_000))
     offsets = pa.array([0] * len(table) + [len(values)], pa.int32())
     cells = pa.ListArray.from_arrays(offsets, values)
     pq.write_table(
