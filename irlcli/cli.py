@@ -317,7 +317,7 @@ def transfer(
         raise UsageError(
             f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one"
         )
-    learned = " ".join([*_method(msgspec.to_builtins(origin.airl)), f"seed {origin.seed}"])
+    learned = _joined([*_method(msgspec.to_builtins(origin.airl)), f"seed {origin.seed}"])
     request = transfer.request(source, origin.env, settings[0], config.transfer, seed, learned)
     session.deliver([request], name)
 
