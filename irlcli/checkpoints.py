@@ -98,12 +98,18 @@ def from_bytes(data: bytes) -> Any:
         raise ValueError((str(error) or type(error).__name__).splitlines()[0][:200]) from None
 
 
-def restore(data: bytes | None, warn: Callable[[str], None]) -> Any:
-    """The state in a stage's checkpoint; None, and a warning, for one that cannot be used."""
+def restore(data: bytes | None, names: set[str], warn: Callable[[str], None]) -> Any:
+    """The state in a stage's checkpoint, a dict of ``names``.
+
+    None for no checkpoint, and with a warning for one that cannot be used.
+    """
     if data is None:
         return None
     try:
-        return from_bytes(data)
+        state = from_bytes(data)
+        if not isinstance(state, dict) or set(state) != names:
+            raise ValueError("it is of another stage")
+        return state
     except ValueError as error:
         warn(f"the checkpoint cannot be used ({error}): starting over")
         return None

@@ -218,7 +218,9 @@ def collect_experts(
         str | None,
         typer.Option(help="Per setting: 10, or 1,3,10 for three. By default those of settings/."),
     ] = None,
-    seed: Seed = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of the recorded episodes. An expert's own seed is always 0.")
+    ] = 0,
     name: Name = None,
 ) -> None:
     """Train an expert in each setting and record its demonstrations."""
@@ -237,14 +239,15 @@ def collect_experts(
 
 
 def _warn_of_missed_bars(session: Session, artefact: Any, bar: float | None) -> None:
-    from irlcli.store import read_json
+    from irlcli.descriptions import Collected
+    from irlcli.references import output
 
-    summary = read_json(session.store.open(artefact, "summary.json"))
-    for row in summary["settings"]:
-        if bar is not None and row["mean_return"] < bar:
+    summary = output(session.store, artefact, "summary.json", Collected)
+    for row in summary.settings:
+        if bar is not None and row.mean_return < bar:
             session.console.warn(
-                f"the expert of {summary['env']} {row['setting']} misses its bar: mean true "
-                f"return {row['mean_return']:.0f} over {row['episodes']} episodes, bar {bar:.0f}"
+                f"the expert of {summary.env} {row.setting} misses its bar: mean true "
+                f"return {row.mean_return:.0f} over {row.episodes} episodes, bar {bar:.0f}"
             )
 
 
@@ -263,7 +266,9 @@ def train_airl(
     select: Annotated[
         str | None, typer.Option(help="Round to keep: last, or best on episodes or on SETTING.")
     ] = None,
-    state_only: Annotated[bool, typer.Option("--state-only", help="g(s), not g(s, a).")] = False,
+    state_only: Annotated[
+        bool | None, typer.Option("--state-only/--no-state-only", help="g(s), or g(s, a).")
+    ] = None,
     seed: Seed = 0,
     name: Name = None,
 ) -> None:
@@ -282,7 +287,7 @@ def train_airl(
         "airl.method": method,
         "airl.penalty_weight": penalty_weight,
         "airl.select": str(parse_setting(env, select)) if "=" in (select or "") else select,
-        "airl.state_only": state_only or None,
+        "airl.state_only": state_only,
     }
     airl = session.settings(env, flags).airl
     parsed = [parse_setting(env, text) for text in settings]
@@ -363,16 +368,18 @@ def _unseen(env: str, config: Any) -> list[Any]:
 
 
 def _print_quality(session: Session, artefact: Any) -> None:
-    from irlcli.store import read_json
+    from irlcli.descriptions import Quality
+    from irlcli.references import output
 
     measures = ("goal_probability", "true_return", "value_difference", "rank_correlation")
+    quality = output(session.store, artefact, "quality.json", Quality)
     rows = [
         [
-            row["setting"] + ("" if row["seen"] else " (unseen)"),
-            *("-" if row[m] is None else f"{row[m]:.2f}" for m in measures),
-            f"{row['log_likelihood']:.1f}",
+            row.setting + ("" if row.seen else " (unseen)"),
+            *("-" if getattr(row, m) is None else f"{getattr(row, m):.2f}" for m in measures),
+            f"{row.log_likelihood:.1f}",
         ]
-        for row in read_json(session.store.open(artefact, "quality.json"))["settings"]
+        for row in quality.settings
     ]
     columns = ["setting", *(m.replace("_", " ") for m in measures), "log-likelihood"]
     out.print_table(columns, rows, stderr=True)
@@ -390,6 +397,8 @@ def transfer(
     name: Name = None,
 ) -> None:
     """Train a new policy on a frozen reward in an unseen setting."""
+    import msgspec
+
     from irlcli.references import tensor_file
     from irlcli.stages import transfer
 
@@ -402,7 +411,8 @@ def transfer(
         raise UsageError(
             f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one"
         )
-    request = transfer.request(source, origin.env, settings[0], config.transfer, seed)
+    learned = _joined([*_method(msgspec.to_builtins(origin.airl)), f"seed {origin.seed}"])
+    request = transfer.request(source, origin.env, settings[0], config.transfer, seed, learned)
     session.deliver([request], name)
 
 
@@ -555,6 +565,10 @@ def play(
         settings += [setting for setting in added if setting not in settings]
     if file.suffix.lower() != ".gif":
         raise UsageError(f"{str(file)!r} does not end in .gif", "a GIF is what can be written")
+    if not file.parent.is_dir():
+        raise UsageError(
+            f"{file.parent} is not a directory: {file} cannot be written there", "make it first"
+        )
 
     from irlcli.checkpoints import load_policy_file
     from irlcli.play import write_gif
@@ -586,12 +600,15 @@ def ls(
     for name, id16 in session.store.names().items():
         names.setdefault(id16, []).append(name)
     index = session.store.index()
+    makers = {
+        o.sha256: a.manifest.record for a in index.artefacts.values() for o in a.manifest.outputs
+    }
     found = [
         {
             "id": a.id,
             "stage": a.manifest.record.stage,
             "names": names.get(a.id, []),
-            "about": _about(a.manifest.record.parameters),
+            "about": _about(a.manifest.record.parameters) + _origin(a.manifest.record, makers),
             "bytes": sum(o.size for o in a.manifest.outputs),
         }
         for a in index.artefacts.values()
@@ -611,12 +628,42 @@ def _about(parameters: dict[str, Any]) -> str:
 
     Any artefact has parameters, also one that somebody made up: nothing is taken for granted.
     """
-    learner = parameters.get("airl") or parameters.get("maxent")
     settings = parameters.get("settings")
     parts = [parameters.get("env"), parameters.get("agent")]
     parts += settings if isinstance(settings, list) else [parameters.get("setting")]
-    parts.append(learner.get("method") if isinstance(learner, dict) else None)
-    parts.append(f"seed {parameters['seed']}" if "seed" in parameters else None)
+    return _joined([*parts, *_learned(parameters)])
+
+
+def _learned(parameters: dict[str, Any]) -> list[Any]:
+    """Method, lambda and seed of a stage that has them."""
+    learner = parameters.get("airl") or parameters.get("maxent")
+    parts = _method(learner) if isinstance(learner, dict) else []
+    return [*parts, f"seed {parameters['seed']}" if "seed" in parameters else None]
+
+
+def _method(learner: dict[str, Any]) -> list[Any]:
+    """The method of a reward, and lambda if the method has one."""
+    from irlcli.settings import PENALISED
+
+    method, weight = learner.get("method"), learner.get("penalty_weight")
+    return [method, f"lambda {weight}" if method in PENALISED else None]
+
+
+def _origin(record: Any, makers: dict[str, Any]) -> str:
+    """What an evaluation's policy and a transfer's reward came from, if it is in the store.
+
+    ``makers`` has what made each output, by the output's content.
+    """
+    parts = []
+    for role in ("policy", "reward"):
+        maker = makers.get(record.inputs.get(role))
+        if maker is not None:
+            parts.append(_joined(["of", maker.stage, *_learned(maker.parameters)]))
+            record = maker
+    return "".join(f" {part}" for part in parts)
+
+
+def _joined(parts: Sequence[Any]) -> str:
     text = " ".join(str(p) for p in parts if p and p != "policy")
     return "".join(c if c.isprintable() else "?" for c in text)[:200]
 
@@ -982,12 +1029,28 @@ def build_app(arguments: Sequence[str]) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     # A callback keeps it a group of commands when there is only one.
-    app.callback()(lambda: None)
+    app.callback()(_top)
     first = arguments[0] if arguments else ""
     for name, (function, runs) in _COMMANDS.items():
         if first not in _COMMANDS or name == first:
             app.command(name)(_with_common_options(function, runs))
     return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        out.print_data(f"irlcli {version('irlcli')}")
+        raise typer.Exit
+
+
+def _top(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print it.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
 
 
 def main() -> None:
@@ -996,6 +1059,7 @@ def main() -> None:
     # collector on again when there is work to do.
     garbage_collector.disable()
     as_json = "--json" in sys.argv
+    out.prepare_streams()
     try:
         # Without arguments, what there is to ask for; typer would call that an error.
         arguments = sys.argv[1:] or ["--help"]
@@ -1009,6 +1073,8 @@ def main() -> None:
         _fail(error, as_json)
     except MemoryError:
         _fail(StageFailed("out of memory", "nothing is half-written: free some and go on"), as_json)
+    except BrokenPipeError:
+        out.hang_up()
     except OSError as error:
         if _debugging():
             raise
@@ -1043,8 +1109,11 @@ def _fail(error: IrlError, as_json: bool) -> None:
         import traceback
 
         traceback.print_exc()
-    out.print_error(error, as_json)
-    sys.exit(error.exit_code)
+    try:
+        out.print_error(error, as_json)
+    finally:
+        # Also where nobody reads the message: the code says the same.
+        sys.exit(error.exit_code)
 
 
 def _debugging() -> bool:

@@ -5,13 +5,14 @@ Rich is loaded only where something is drawn: a hit prints one line without it.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from irlcli.errors import IrlError, UsageError
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 JSON_VERSION = 1
 _PLAIN_SECONDS = 10.0
+_MAX_MESSAGE, _MAX_HINT = 900, 4000
+# What a file says may reach the screen: it must not drive the terminal, nor forge a second line.
+_CONTROLS = dict.fromkeys([*range(32), *range(127, 160), *range(0x202A, 0x202F)], "?")
+_CONTROLS_BUT_NEWLINE = {code: c for code, c in _CONTROLS.items() if code != ord("\n")}
 
 
 class TerminalConsole:
@@ -34,6 +39,8 @@ class TerminalConsole:
         self._first_done: int | None = None
         self._tensorboard = tensorboard
         self._writer = None
+        if tensorboard is not None:
+            _require_tensorboard()
         self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
 
     def start(self, label: str, resumed: bool) -> None:
@@ -67,7 +74,9 @@ class TerminalConsole:
             return
         if self._writer is None:
             directory = self._label.replace(" ", "_").replace(",", "")
-            self._writer = _summary_writer(self._tensorboard / directory)
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(self._tensorboard / directory))
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
@@ -126,22 +135,49 @@ class TerminalConsole:
             self._print(text)
 
     def _print(self, text: str, style: str = "") -> None:
+        text = text.translate(_CONTROLS)
         if self._live is not None:
             self._live.console.print(text, style=style, markup=False, highlight=False)
         elif style and sys.stderr.isatty() and "NO_COLOR" not in os.environ:
-            print(f"\x1b[1;33m{text}\x1b[0m", file=sys.stderr, flush=True)
+            _write(f"\x1b[1;33m{text}\x1b[0m", sys.stderr)
         else:
-            print(text, file=sys.stderr, flush=True)
+            _write(text, sys.stderr)
+
+
+def prepare_streams() -> None:
+    """Make stdout UTF-8 in every locale, and give a closed standard stream a place to go.
+
+    File names that are no text come out as the bytes they are.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            # Else the next file opened, an artefact's perhaps, would have its descriptor.
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(encoding="utf-8", errors="surrogateescape")
+
+
+def hang_up() -> NoReturn:
+    """The quiet end of a program whose output nobody reads any more (128 + SIGPIPE)."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            # Python would complain again when it flushes at shutdown.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    sys.exit(141)
+
+
+def _write(text: str, stream: TextIO) -> None:
+    try:
+        print(text, file=stream, flush=True)
+    except BrokenPipeError:
+        hang_up()
 
 
 def print_data(text: str) -> None:
     """Lines of data on stdout; quietly the end of the program if nobody reads them any more."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # Python would complain again when it flushes at shutdown.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
+    _write(text.translate(_CONTROLS_BUT_NEWLINE), sys.stdout)
 
 
 def print_json(kind: str, value: Mapping[str, Any]) -> None:
@@ -154,16 +190,14 @@ def print_table(
 ) -> None:
     """A table for people; plain text with aligned columns where the stream is no terminal."""
     stream = sys.stderr if stderr else sys.stdout
+    rows = [[str(cell).translate(_CONTROLS) for cell in row] for row in rows]
     if not stream.isatty():
-        widths = [max(len(str(r[i])) for r in [columns, *rows]) for i in range(len(columns))]
+        widths = [max(len(r[i]) for r in [columns, *rows]) for i in range(len(columns))]
         lines = [title] if title else []
         for row in [columns, *rows]:
-            cells = (str(c).ljust(w) for c, w in zip(row, widths, strict=True))
+            cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             lines.append("  ".join(cells).rstrip())
-        if stderr:
-            print("\n".join(lines), file=stream, flush=True)
-        else:
-            print_data("\n".join(lines))
+        _write("\n".join(lines), stream)
         return
     from rich.console import Console
     from rich.table import Table
@@ -173,25 +207,24 @@ def print_table(
     for column in columns:
         table.add_column(column)
     for row in rows:
-        table.add_row(*(Text(str(cell)) for cell in row))
+        table.add_row(*(Text(cell) for cell in row))
     Console(stderr=stderr).print(table)
 
 
 def print_error(error: IrlError, as_json: bool) -> None:
     """One line and its hint on stderr; with ``--json`` a document on stdout too."""
+    message, hint = _shortened(error.message, _MAX_MESSAGE), _shortened(error.hint, _MAX_HINT)
     if as_json:
-        print_json(
-            "error",
-            {
-                "message": error.message,
-                "hint": error.hint,
-                "exit_code": error.exit_code,
-                **error.details,
-            },
-        )
-    print(f"error: {error.message}", file=sys.stderr)
-    if error.hint:
-        print(f"hint: {error.hint}", file=sys.stderr)
+        document = {"message": message, "hint": hint, "exit_code": error.exit_code}
+        print_json("error", {**document, **error.details})
+    _write(f"error: {message}".translate(_CONTROLS), sys.stderr)
+    if hint:
+        _write(f"hint: {hint}".translate(_CONTROLS), sys.stderr)
+
+
+def _shortened(text: str, most: int) -> str:
+    """``text`` without its middle where what it quotes is very long."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
 def _duration(seconds: float) -> str:
@@ -200,11 +233,12 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
 
 
-def _summary_writer(directory: Path):
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
+def _require_tensorboard() -> None:
+    """Say before the work, not after its first round, that the mirror cannot be written."""
+    import importlib.util
+
+    if importlib.util.find_spec("tensorboard") is None:
         raise UsageError(
-            "--tensorboard needs the package tensorboard", "pip install 'irlcli[tensorboard]'"
-        ) from None
-    return SummaryWriter(str(directory))
+            "--tensorboard needs the package tensorboard, which is not installed",
+            f"{sys.executable} -m pip install tensorboard, or leave --tensorboard away",
+        )

@@ -8,7 +8,8 @@ demonstrations are equal bytes.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import stat
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,16 @@ from irlcli.trajectories import Trajectory
 SCHEMA = 1
 STEPS = "steps.parquet"
 EPISODES = "episodes.parquet"
+_MAX_SETTING_LENGTH = 200
+_MAX_TEXT_BYTES = 1 << 20
 _METADATA_KEY = b"irlcli"
+# A kilobyte of Parquet can stand for terabytes, so what a file declares is read first: refused is
+# more than 2 GiB that is also more than 100 times the file, which no recorded numbers are.
+_MAX_FILE_BYTES = 8 << 30
+_MAX_DECODED_BYTES = 2 << 30
+_MAX_RATIO = 100
+# A step is decoded to arrays, an episode to Python's objects.
+_BYTES_PER_VALUE = {STEPS: 8, EPISODES: 100}
 
 
 @dataclass(frozen=True)
@@ -144,7 +154,7 @@ def read_metadata(directory: Path) -> dict[str, Any]:
     """
     path = directory / EPISODES
     try:
-        with pq.ParquetFile(path) as file:
+        with _opened(path) as file:
             tags = json.loads((file.schema_arrow.metadata or {})[_METADATA_KEY])
         version, env = tags["schema"], tags["env"]
         if type(version) is not int or not isinstance(env, str):
@@ -171,9 +181,10 @@ def read_demonstrations(directory: Path) -> Demonstrations:
     """
     tags = read_metadata(directory)
     try:
-        episodes = pq.read_table(directory / EPISODES, page_checksum_verification=True)
-        steps = pq.read_table(directory / STEPS, page_checksum_verification=True)
-        trajectories = _parse(steps, episodes)
+        with _opened(directory / STEPS) as steps, _opened(directory / EPISODES) as episodes:
+            # Before anything is decoded: the columns of a dataset cannot be nested or long.
+            _check_schemas(steps.schema_arrow, episodes.schema_arrow)
+            trajectories = _parse(steps.read(), episodes.read())
     except FileNotFoundError as error:
         raise IntegrityError(f"{error.filename or STEPS} is missing in {directory}") from None
     except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, RecursionError) as error:
@@ -183,20 +194,77 @@ def read_demonstrations(directory: Path) -> Demonstrations:
     return Demonstrations(tags["env"], trajectories, tags)
 
 
-def _parse(steps: pa.Table, episodes: pa.Table) -> dict[str, tuple[Trajectory, ...]]:
-    obs_type, action_type = steps.schema.field("obs").type, steps.schema.field("action").type
+def _opened(path: Path) -> pq.ParquetFile:
+    """The Parquet file ``path``, its footer read, nothing of it too large.
+
+    Raises:
+        ValueError: no plain file, or too large.
+        OSError, ArrowException: not a readable Parquet file.
+    """
+    information = path.stat()
+    if not stat.S_ISREG(information.st_mode):
+        # Opening a named pipe would wait for a writer that never comes.
+        raise ValueError("it is not a plain file")
+    if information.st_size > _MAX_FILE_BYTES:
+        raise ValueError(f"it is larger than {_MAX_FILE_BYTES >> 30} GiB")
+    # As a dictionary a long text counts once, however many rows say it.
+    texts = ["setting"] if path.name == EPISODES else []
+    file = pq.ParquetFile(path, read_dictionary=texts, page_checksum_verification=True)
+    declared = _declared_bytes(file.metadata, _BYTES_PER_VALUE[path.name])
+    if declared > max(_MAX_DECODED_BYTES, _MAX_RATIO * information.st_size):
+        file.close()
+        raise ValueError(f"{information.st_size:,} bytes that declare {declared:,}")
+    return file
+
+
+def _declared_bytes(metadata: pq.FileMetaData, bytes_per_value: int) -> int:
+    """What decoding takes if the footer is honest: unpacked pages, and so much for every value."""
+    total = bytes_per_value * metadata.num_rows * metadata.num_columns
+    texts = sum(
+        column.total_uncompressed_size - _MAX_SETTING_LENGTH * column.num_values
+        for column in _chunks(metadata)
+        if column.physical_type == "BYTE_ARRAY"
+    )
+    if texts > _MAX_TEXT_BYTES:
+        raise ValueError(f"its texts take {texts:,} bytes")
+    for column in _chunks(metadata):
+        total += column.total_uncompressed_size + bytes_per_value * column.num_values
+    return total
+
+
+def _chunks(metadata: pq.FileMetaData) -> Iterator[pq.ColumnChunkMetaData]:
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        yield from map(group.column, range(group.num_columns))
+
+
+def _check_schemas(steps: pa.Schema, episodes: pa.Schema) -> None:
+    obs_type, action_type = steps.field("obs").type, steps.field("action").type
     if not pa.types.is_fixed_size_list(obs_type):
         raise ValueError("obs is no fixed_size_list")
     discrete = pa.types.is_integer(action_type)
     if not discrete and not pa.types.is_fixed_size_list(action_type):
         raise ValueError("action is neither int64 nor a fixed_size_list")
     size = obs_type.list_size
+    index = episodes.get_field_index("setting")
+    if index >= 0 and pa.types.is_dictionary(episodes.field(index).type):
+        text = episodes.field(index).type.value_type
+        episodes = episodes.set(index, episodes.field(index).with_type(text))
     expected = _steps_schema(size, None if discrete else action_type.list_size)
-    for table, schema in ((steps, expected), (episodes, _episodes_schema(size))):
-        if not table.schema.equals(schema, check_metadata=False):
+    for found, schema in ((steps, expected), (episodes, _episodes_schema(size))):
+        if not found.equals(schema, check_metadata=False):
             raise ValueError("columns or their types are not those of a dataset")
+
+
+def _parse(steps: pa.Table, episodes: pa.Table) -> dict[str, tuple[Trajectory, ...]]:
+    for table in (steps, episodes):
         if any(column.null_count for column in table.columns):
             raise ValueError("a column holds nulls")
+    longest = max(
+        (len(text) for chunk in episodes["setting"].chunks for text in chunk.dictionary.tolist()),
+        default=0,
+    )
+    if longest > _MAX_SETTING_LENGTH:
+        raise ValueError(f"a setting of {longest:,} characters")
     rows = episodes.to_pylist()
     if not rows:
         raise ValueError("there is no episode in it")
@@ -206,6 +274,7 @@ def _parse(steps: pa.Table, episodes: pa.Table) -> dict[str, tuple[Trajectory, .
     ):
         raise ValueError("steps and episodes do not fit each other")
     observations = _matrix(steps["obs"])
+    discrete = pa.types.is_integer(steps["action"].type)
     actions = steps["action"].to_numpy() if discrete else _matrix(steps["action"])
     rewards = steps["reward"].to_numpy()
     groups: dict[str, list[Trajectory]] = {}

@@ -141,7 +141,53 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
 
 
+class SettingReturn(Struct, frozen=True, kw_only=True):
+    """What an expert earned in one setting while it was recorded."""
+
+    setting: str
+    episodes: Annotated[int, Meta(ge=1)]
+    mean_return: Finite
+
+
+class Collected(Struct, frozen=True, kw_only=True):
+    """``summary.json`` of a dataset."""
+
+    env: str
+    settings: tuple[SettingReturn, ...]
+
+
+class SettingQuality(Struct, frozen=True, kw_only=True):
+    """How the policy that is optimal for a tabular reward fares in one setting."""
+
+    setting: str
+    seen: bool
+    goal_probability: Finite | None
+    true_return: Finite | None
+    value_difference: Finite | None
+    rank_correlation: Finite | None
+    log_likelihood: Finite
+
+
+class Quality(Struct, frozen=True, kw_only=True):
+    """``quality.json`` of train-maxent."""
+
+    settings: tuple[SettingQuality, ...]
+
+
 Form = TypeVar("Form", Reward, TabularReward, Policy, Dataset, Evaluation)
+AnyForm = TypeVar("AnyForm", bound=Struct)
+
+
+def convert(value: Any, form: type[AnyForm], source: Path | str) -> AnyForm:
+    """``value`` (JSON) as a ``form``; names in it are not looked up.
+
+    Raises:
+        IntegrityError: of another form; the message names ``source``.
+    """
+    try:
+        return msgspec.convert(value, form)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise _malformed(source, error) from None
 
 
 def parse(value: Any, form: type[Form], source: Path | str) -> Form:
@@ -150,8 +196,8 @@ def parse(value: Any, form: type[Form], source: Path | str) -> Form:
     Raises:
         IntegrityError: anything else; the message names ``source``.
     """
+    description = convert(value, form, source)
     try:
-        description = msgspec.convert(value, form)
         if isinstance(description, Evaluation):
             env, settings = description.policy.env, [s.setting for s in description.settings]
         else:
@@ -159,7 +205,11 @@ def parse(value: Any, form: type[Form], source: Path | str) -> Form:
         environment(env)
         for setting in settings:
             parse_setting(env, setting)
-    except (msgspec.ValidationError, UsageError, RecursionError) as error:
-        reason = str(error).splitlines()[0][:300]
-        raise IntegrityError(f"{source}: its description is malformed ({reason})") from None
+    except UsageError as error:
+        raise _malformed(source, error) from None
     return description
+
+
+def _malformed(source: Path | str, error: Exception) -> IntegrityError:
+    reason = str(error).splitlines()[0][:300]
+    return IntegrityError(f"{source}: its description is malformed ({reason})")

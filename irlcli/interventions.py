@@ -67,7 +67,6 @@ class Knob(NamedTuple):
     kinds: tuple[Kind, ...]
     low: float
     high: float
-    default: str
     what: str
     whole: bool = False
 
@@ -89,12 +88,10 @@ class Environment(NamedTuple):
 
 _FRICTION = "tangential, torsional and rolling friction of the robot's links"
 _WALKER_KNOBS = {
-    "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "1x", "mass of every link"),
-    "goal-y": Knob(
-        "goal_y", ("absolute",), -10000.0, 10000.0, "0", "the goal is at (1000, goal-y) m"
-    ),
+    "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "mass of every link"),
+    "goal-y": Knob("goal_y", ("absolute",), -10000.0, 10000.0, "the goal is at (1000, goal-y) m"),
     "direction": Knob(
-        "direction", ("absolute", "range"), -180.0, 180.0, "0", "of the goal, degrees from ahead"
+        "direction", ("absolute", "range"), -180.0, 180.0, "of the goal, degrees from ahead"
     ),
 }
 
@@ -104,10 +101,10 @@ ENVIRONMENTS: dict[str, Environment] = {
         gym_id="irlcli/LunarLander-v0",
         max_episode_steps=1000,
         knobs={
-            "bounce": Knob("bounce", ("absolute",), 0.0, 1.0, "0", "restitution of hull and legs"),
-            "friction": Knob("friction", ("absolute",), 0.0, 10.0, "0.1", "friction of the moon"),
+            "bounce": Knob("bounce", ("absolute",), 0.0, 1.0, "restitution of hull and legs"),
+            "friction": Knob("friction", ("absolute",), 0.0, 10.0, "friction of the moon"),
             "engine-power": Knob(
-                "engine_power", ("multiplier",), 0.05, 20.0, "1x", "power of the main engine"
+                "engine_power", ("multiplier",), 0.05, 20.0, "power of the main engine"
             ),
         },
     ),
@@ -117,10 +114,8 @@ ENVIRONMENTS: dict[str, Environment] = {
         max_episode_steps=1000,
         knobs={
             **_WALKER_KNOBS,
-            "friction": Knob("friction", ("triple",), 0.0, 10.0, "1.5:0:0", _FRICTION),
-            "leg-length": Knob(
-                "leg_length", ("multiplier",), 0.2, 5.0, "1x", "length of the hind legs"
-            ),
+            "friction": Knob("friction", ("triple",), 0.0, 10.0, _FRICTION),
+            "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
         },
     ),
     "half-cheetah": Environment(
@@ -129,9 +124,9 @@ ENVIRONMENTS: dict[str, Environment] = {
         max_episode_steps=1000,
         knobs={
             **_WALKER_KNOBS,
-            "friction": Knob("friction", ("triple",), 0.0, 10.0, "0.8:0:0", _FRICTION),
+            "friction": Knob("friction", ("triple",), 0.0, 10.0, _FRICTION),
             "leg-length": Knob(
-                "leg_length", ("absolute", "multiplier"), 0.2, 5.0, "1", "length of both legs"
+                "leg_length", ("absolute", "multiplier"), 0.2, 5.0, "length of both legs"
             ),
         },
     ),
@@ -139,7 +134,7 @@ ENVIRONMENTS: dict[str, Environment] = {
         name="reacher",
         gym_id="irlcli/Reacher-v0",
         max_episode_steps=150,
-        knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "1x", "of 9.8 m/s^2")},
+        knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "of 9.8 m/s^2")},
         physics=2,
     ),
     "gridworld": Environment(
@@ -148,10 +143,10 @@ ENVIRONMENTS: dict[str, Environment] = {
         max_episode_steps=32,
         knobs={
             "path-group": Knob(
-                "path_group", ("absolute",), 0, 3, "0", "the open gate, 0 for no gates", whole=True
+                "path_group", ("absolute",), 0, 3, "the open gate, 0 for no gates", whole=True
             ),
             "blocked": Knob(
-                "blocked", ("absolute",), 0, 2, "0", "how many groups' paths are barred", whole=True
+                "blocked", ("absolute",), 0, 2, "how many groups' paths are barred", whole=True
             ),
         },
         tabular=True,

@@ -95,6 +95,19 @@ def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluatio
     return artefact, descriptions.parse(read_json(path), descriptions.Evaluation, path)
 
 
+def output(
+    store: Store, artefact: Artefact, name: str, form: type[descriptions.AnyForm]
+) -> descriptions.AnyForm:
+    """The JSON output ``name`` of ``artefact`` as a ``form``.
+
+    Raises:
+        NotFound: the artefact has no such output.
+        IntegrityError: damaged, or of another form.
+    """
+    path = store.open(artefact, _only(artefact, name))
+    return descriptions.convert(read_json(path), form, path)
+
+
 def _only(artefact: Artefact, name: str) -> str:
     names = [o.path for o in artefact.manifest.outputs]
     if name not in names:

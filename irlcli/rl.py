@@ -28,6 +28,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from irlcli import envs
+from irlcli.activations import ACTIVATIONS
 from irlcli.descriptions import PolicyNetwork
 from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
@@ -36,8 +37,6 @@ from irlcli.interventions import Setting, environment
 from irlcli.seeds import derive
 from irlcli.settings import PPOSettings
 from irlcli.trajectories import Trajectory
-
-_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
 
 # Normalised observations and rewards are clipped to this, as in SB3's VecNormalize.
 _CLIP = 10.0
@@ -438,7 +437,7 @@ def load_policy(
         world.action_space,
         lambda _: 0.0,
         net_arch=list(network_.net_arch),
-        activation_fn=_ACTIVATIONS[network_.activation],
+        activation_fn=ACTIVATIONS[network_.activation],
         ortho_init=network_.ortho_init,
         features_extractor_class=_extractor(network_.normalise_observations),
         use_sde=network_.use_sde,
@@ -588,7 +587,7 @@ def _idle_actions(space: gymnasium.Space, count: int) -> np.ndarray:
 def _policy_kwargs(ppo: PPOSettings) -> dict[str, Any]:
     return {
         "net_arch": list(ppo.net_arch),
-        "activation_fn": _ACTIVATIONS[ppo.activation],
+        "activation_fn": ACTIVATIONS[ppo.activation],
         "ortho_init": ppo.ortho_init,
         "log_std_init": ppo.log_std_init or 0.0,
         "features_extractor_class": _extractor(bool(ppo.normalise_observations)),

@@ -5,6 +5,7 @@ environment's file, its profile, ``--settings FILE``, then flags and ``--set``. 
 variables never enter: equal settings give equal artefacts wherever they run.
 """
 
+import stat
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,9 @@ from irlcli.interventions import environment, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
 
+# A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
+_MAX_TOML_BYTES = 64 << 10
+_MAX_TOML_LINE = 2000
 # Bounded, so that every count fits 64 bits and no key holds an infinity or NaN.
 _MOST = 2**53
 _LARGE = 1e300
@@ -42,8 +46,9 @@ PENALISED = ("irm", "irm-shuffled")
 class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """PPO (paper App. C names the values of rl-baselines3-zoo). ``linear`` falls to zero."""
 
-    n_envs: Count = 16
-    n_steps: Count = 1024
+    # Bounded, so that no file can ask for more worlds or steps than memory holds.
+    n_envs: Annotated[int, Meta(ge=1, le=1024)] = 16
+    n_steps: Annotated[int, Meta(ge=1, le=65536)] = 1024
     rollouts_per_round: Count = 1
     batch_size: Annotated[int, Meta(ge=2, le=_MOST)] = 512
     n_epochs: Count = 4
@@ -268,7 +273,13 @@ def _settings_directory() -> Path:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        information = path.stat()
+        if not stat.S_ISREG(information.st_mode) and not stat.S_ISDIR(information.st_mode):
+            # Opening a named pipe would wait for a writer that never comes.
+            raise UsageError(f"{path} is not a plain file", "name a TOML file with --settings")
+        if information.st_size > _MAX_TOML_BYTES:
+            raise ValueError(f"it is larger than {_MAX_TOML_BYTES >> 10} KiB")
+        return _parse_toml(path.read_text("utf-8"))
     except (ValueError, RecursionError) as error:
         raise UsageError(
             f"{path} is not valid TOML: {error}", "see settings/ for examples"
@@ -277,6 +288,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(
             f"{path} cannot be read: {error.strerror}", "name a TOML file with --settings"
         ) from None
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    if max(map(len, text.splitlines()), default=0) > _MAX_TOML_LINE:
+        raise ValueError(f"a line is longer than {_MAX_TOML_LINE} characters")
+    return tomllib.loads(text)
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -351,12 +368,13 @@ def _override(item: str) -> dict[str, Any]:
 
 def _typed(text: str, kind: Any, field: str) -> Any:
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        value = _parse_toml(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text
     try:
         return msgspec.to_builtins(msgspec.convert(value, kind))
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:
+        # Arguments may hold bytes that are no text.
         raise UsageError(
             f"--set {field}={text}: {str(error).partition(' - at ')[0]}", _field_hint(field)
         ) from None

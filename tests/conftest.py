@@ -16,12 +16,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from hypothesis import settings
 
 from irlcli import cli as command_line
 from irlcli.store import KeyRecord, Published, Store
 
 # A shell that starts the tests in the background makes them, and their children, deaf to it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# How long an example takes depends on who else uses the machine.
+settings.register_profile("irlcli", deadline=None)
+settings.load_profile("irlcli")
 
 
 @dataclass(frozen=True)

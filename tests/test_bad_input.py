@@ -204,7 +204,7 @@ def wrong_files(tmp_path) -> Path:
 @pytest.fixture
 def second_environment(monkeypatch):
     """Another environment, known by name only, for what belongs to another one."""
-    knob = interventions.Knob("span", ("multiplier",), 0.0, 9.0, "1x", "a span")
+    knob = interventions.Knob("span", ("multiplier",), 0.0, 9.0, "a span")
     world = interventions.Environment("test-world", "test/World-v0", 10, {"span": knob})
     monkeypatch.setitem(interventions.ENVIRONMENTS, "test-world", world)
 

@@ -186,7 +186,9 @@ def test_the_metrics_of_a_long_run_fit_into_its_checkpoint():
     row = {"round": 10**6, "setting": "mass=0.5x", "true_return": 1 / 3, "progress": float("nan")}
     rows = [row] * 100_000
     assert len(json.dumps(rows)) > 8 << 20
-    state = checkpoints.restore(_state(Trainer(), None, 7, rows), pytest.fail)
+    data = _state(Trainer(), None, None, 7, rows)
+    names = {"trainer", "adversary", "selection", "round", "rows"}
+    state = checkpoints.restore(data, names, pytest.fail)
     restored = json.loads(state["rows"].numpy().tobytes())
     assert len(restored) == len(rows) and repr(restored[-1]) == repr(row)
 

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-_ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
+from irlcli.activations import ACTIVATIONS
 
 
 def mlp(inputs: int, hidden: Sequence[int], activation: str) -> nn.Sequential:
     """A perceptron with ``hidden`` layers and one output; [B, inputs] to [B, 1]."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), _ACTIVATIONS[activation]()]
+        layers += [nn.Linear(inputs, width), ACTIVATIONS[activation]()]
         inputs = width
     return nn.Sequential(*layers, nn.Linear(inputs, 1))
 

@@ -10,6 +10,9 @@ from irlcli.interventions import Setting, environment, parse_setting
 from irlcli.settings import GridworldSettings, Settings
 from irlcli.stages import From, Job, Request, Stage, train_expert
 
+# Episodes become Python objects when a dataset is read; see dataset.py.
+_MOST_EPISODES = 100_000
+
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a dataset depends on, besides its experts."""
@@ -53,6 +56,11 @@ def request(
         raise UsageError(
             f"{len(counts)} episode counts for {len(settings_)} settings",
             "give one count for all settings or one for each, all at least 1",
+        )
+    if sum(counts) > _MOST_EPISODES:
+        raise UsageError(
+            f"{sum(counts):,} episodes are more than the {_MOST_EPISODES:,} of one dataset",
+            "record fewer, or spread them over several seeds",
         )
     texts = tuple(str(s) for s in settings_)
     label = f"collect-experts {env} {', '.join(texts)} seed {seed}"

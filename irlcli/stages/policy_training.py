@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from irlcli import checkpoints
+from irlcli.errors import IntegrityError
 from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
 from irlcli.stages import Job
 from irlcli.stages.adversary import Adversary
@@ -37,14 +38,10 @@ def train_rounds(
     first, rows = 0, []
     if adversary is not None:
         reward = adversary.reward
-    state = checkpoints.restore(job.checkpoints.load(), job.console.warn)
+    names = {"trainer", "adversary", "selection", "round", "rows"}
+    state = checkpoints.restore(job.checkpoints.load(), names, job.console.warn)
     if state is not None:
-        trainer.load_state_dict(state["trainer"])
-        if adversary is not None:
-            adversary.load_state_dict(state["adversary"])
-        if selection is not None:
-            selection.load_state_dict(state["selection"])
-        first, rows = state["round"], json.loads(state["rows"].numpy().tobytes())
+        first, rows = _resume(job, trainer, adversary, selection, state)
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
         _warn(job, index, rollouts, settings)
@@ -64,6 +61,34 @@ def train_rounds(
     if selection is not None:
         selection.restore(trainer.policy, adversary)
     return rows
+
+
+def _resume(
+    job: Job,
+    trainer: PPOTrainer,
+    adversary: Adversary | None,
+    selection: Selection | None,
+    state: Row,
+) -> tuple[int, list[Row]]:
+    """Number of rounds done and their rows; all go on from ``state``.
+
+    Raises:
+        IntegrityError: a state that somebody made, or another version of the program.
+    """
+    try:
+        trainer.load_state_dict(state["trainer"])
+        if adversary is not None:
+            adversary.load_state_dict(state["adversary"])
+        if selection is not None:
+            selection.load_state_dict(state["selection"])
+        return int(state["round"]), list(json.loads(state["rows"].numpy().tobytes()))
+    except Exception as error:
+        # Whatever a crafted state makes torch and Python raise.
+        raise IntegrityError(
+            f"the checkpoint in {job.output.parent} does not fit its stage "
+            f"({type(error).__name__})",
+            "remove that directory, then run the same command again to start over",
+        ) from None
 
 
 def _state(

@@ -131,7 +131,7 @@ def run(job: Job) -> None:
                 demos = maxent.shuffle_settings(demos, seed)
             occupancy[shuffled].append(maxent.expert_occupancy(settings, demos, grid.horizon))
     found = list(variants(p.penalty_weights, p.l2s))
-    state = checkpoints.restore(job.checkpoints.load(), job.console.warn)
+    state = checkpoints.restore(job.checkpoints.load(), {"rewards", "fit"}, job.console.warn)
     rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
     while len(rewards) < len(PENALTIES):
         penalty = PENALTIES[len(rewards)]

@@ -66,6 +66,7 @@ def run(job: Job) -> None:
         job.console.progress(done, m.iterations, "iterations", {})
         job.checkpoints.offer(lambda: checkpoints.to_bytes(state()))
 
+    names = {"iterations", "networks", "optimizer", "records"}
     with gridworlds.usable_input():
         fit = maxent.fit(
             settings,
@@ -80,7 +81,7 @@ def run(job: Job) -> None:
             hidden=m.hidden if m.features == "learned" else 0,
             iterations=m.iterations,
             learning_rate=m.learning_rate,
-            state=checkpoints.restore(job.checkpoints.load(), job.console.warn),
+            state=checkpoints.restore(job.checkpoints.load(), names, job.console.warn),
             after_record=after_record,
         )
     description = descriptions.TabularReward(

@@ -21,9 +21,17 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def request(
-    reward: Source | From, env: str, setting: Setting, transfer: TransferSettings, seed: int = 0
+    reward: Source | From,
+    env: str,
+    setting: Setting,
+    transfer: TransferSettings,
+    seed: int = 0,
+    learned: str = "",
 ) -> Request:
     """A policy trained on ``reward`` (a ``reward.pt``) in ``setting``.
+
+    ``learned`` says in the label how the reward was learned, so that one transfer can be told
+    from another; it is no part of the identity.
 
     Outputs ``policy.pt``, ``policy.json`` and ``metrics.parquet``.
 
@@ -38,7 +46,7 @@ def request(
         seed=seed,
         transfer=transfer,
     )
-    label = f"transfer {env} {setting} seed {seed}"
+    label = f"transfer {env} {setting} seed {seed}" + (f" of {learned}" if learned else "")
     return Request(STAGE, parameters, {"reward": reward}, label)
 
 

@@ -158,6 +158,8 @@ def _parse_manifest(value: Any) -> Manifest:
         raise ValueError(f"schema {value['schema']!r} is unknown")
     if not isinstance(value["stage"], str) or type(value["stage_version"]) is not int:
         raise ValueError("stage or stage_version has the wrong type")
+    if not value["stage"].isprintable():
+        raise ValueError("stage holds unprintable characters")
     if not isinstance(value["parameters"], dict) or not isinstance(value["inputs"], dict):
         raise ValueError("parameters or inputs is no object")
     for role, sha in value["inputs"].items():

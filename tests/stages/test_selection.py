@@ -133,7 +133,9 @@ def test_lambda_is_the_one_that_does_best_in_the_settings_left_out(chosen):
     assert made["chosen"] == made["weights"][int(np.argmax(means))]
     assert record.parameters["airl"]["penalty_weight"] == made["chosen"]
     assert set(record.inputs) == {"demonstrations", "penalty choice"}
-    sources = {role: found[0].manifest.record for role, found in chosen.index().parents(choice).items()}
+    sources = {
+        role: found[0].manifest.record for role, found in chosen.index().parents(choice).items()
+    }
     for weight in ("0.1", "1"):
         for setting, other in ((FIRST, SECOND), (SECOND, FIRST)):
             airl = sources[f"lambda {weight} without {setting}"].parameters["airl"]

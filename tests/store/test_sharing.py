@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -239,13 +240,14 @@ def test_nothing_is_collected_while_a_command_uses_it(irl, store_copy, monkeypat
     if text.startswith("HIT"):
         text = f"transfer --reward {store_copy.airl} --ood 1.5x --profile smoke --name kept"
     asked = []
-    original = console.print_data
+    original = console._write
 
-    def collecting(line):
-        with pytest.raises(Busy):
-            store.collect(0.0)
-        asked.append(line)
-        original(line)
+    def collecting(line, stream):
+        if stream is sys.stdout:
+            with pytest.raises(Busy):
+                store.collect(0.0)
+            asked.append(line)
+        original(line, stream)
 
     set_name = Store.set_name
 
@@ -254,7 +256,7 @@ def test_nothing_is_collected_while_a_command_uses_it(irl, store_copy, monkeypat
             store.collect(0.0)
         set_name(self, name, artefact)
 
-    monkeypatch.setattr(console, "print_data", collecting)
+    monkeypatch.setattr(console, "_write", collecting)
     monkeypatch.setattr(Store, "set_name", naming)
     line = text.format(id=store_copy.transfer).split()
     result = irl(*line, "--store", store_copy.path)

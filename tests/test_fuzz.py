@@ -1,0 +1,60 @@
+"""The short form of benchmarks/fuzz.py: changed inputs are taken or refused by one of our errors.
+
+The long form follows coverage: ``python -m benchmarks.fuzz --seconds 600``.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.fuzz import TARGETS, Coverage, mutate
+from irlcli.errors import IrlError
+from irlcli.interventions import parse_settings
+
+
+@pytest.fixture(scope="module", params=sorted(TARGETS))
+def target(request, tmp_path_factory):
+    before = os.getcwd()
+    yield TARGETS[request.param](tmp_path_factory.mktemp("fuzz"))
+    os.chdir(before)
+
+
+def test_what_fuzzing_begins_with_is_read(target):
+    """At least one sound input each, so that mutation begins inside the format."""
+    taken = []
+    for data in target.seeds:
+        try:
+            target.read(data)
+            taken.append(data)
+        except IrlError:
+            continue
+    assert taken
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32), rounds=st.integers(1, 3))
+def test_changed_inputs_are_taken_or_refused(target, seed, rounds):
+    rng = random.Random(seed)
+    data = rng.choice(target.seeds)
+    for _ in range(rounds):
+        data = mutate(data, target.seeds, rng)
+    try:
+        target.read(data)
+    except IrlError as error:
+        assert str(error) and error.exit_code in (2, 3, 4)
+
+
+def test_coverage_sees_which_lines_an_input_reaches():
+    with Coverage() as sound:
+        parse_settings("lunar-lander", "bounce=0.5")
+    with Coverage() as again:
+        parse_settings("lunar-lander", "bounce=0.5")
+    with Coverage() as other, pytest.raises(IrlError):
+        parse_settings("lunar-lander", "bounce=much")
+    assert sound.steps and sound.steps == again.steps
+    assert other.steps - sound.steps
