@@ -15,7 +15,8 @@ import pickletools
 import stat
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,22 @@ def restore(data: bytes | None, names: set[str], warn: Callable[[str], None]) ->
     except ValueError as error:
         warn(f"the checkpoint cannot be used ({error}): starting over")
         return None
+
+
+@contextmanager
+def fitting(directory: Path, *errors: type[Exception]) -> Iterator[None]:
+    """Name the scratch ``directory`` whose checkpoint holds a state that raises ``errors``.
+
+    Raises:
+        IntegrityError: a state that somebody made, or another version of the program.
+    """
+    try:
+        yield
+    except errors as error:
+        raise IntegrityError(
+            f"the checkpoint in {directory} does not fit its stage ({type(error).__name__})",
+            "remove that directory, then run the same command again to start over",
+        ) from None
 
 
 def _check_globals(data: bytes) -> None:

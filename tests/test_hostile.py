@@ -27,7 +27,7 @@ from irlcli import cli, console, provenance
 from irlcli.checkpoints import RefusedCode, from_bytes, load_reward_file, restore, to_bytes
 from irlcli.dataset import EPISODES, STEPS
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.stages import transfer
+from irlcli.stages import train_maxent, transfer
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
@@ -385,6 +385,127 @@ def test_a_checkpoint_made_by_somebody_is_named(irl, store_copy, changes):
     shutil.rmtree(store.root / ".work" / key)
     again = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
     assert Path(again.out.strip()).name == store_copy.transfer
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"networks": {}},
+        {"optimizer": {"state": {}, "param_groups": []}},
+        {"records": []},
+        {"records": "x"},
+        {"iterations": "many"},
+    ],
+)
+def test_a_gridworld_checkpoint_made_by_somebody_is_named(irl, maze_store, tmp_path, changes):
+    path = tmp_path / "runs"
+    shutil.copytree(maze_store, path, symlinks=True)
+    store = Store(path)
+    found = store.get(store.names()["maxent"]).manifest.record
+    (store.root / ".keys" / found.key).unlink()
+    state = {"iterations": 1, "networks": {}, "optimizer": {}, "records": [], **changes}
+    header = provenance.Header(
+        schema=provenance.SCHEMA,
+        stage="train-maxent",
+        stage_version=train_maxent.STAGE.version,
+        libraries=provenance.libraries(),
+        attempts=(),
+    )
+    with store.working_on(found.key, wait=False) as scratch:
+        scratch.save(header.encode(to_bytes(state)))
+    done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", path)
+    assert_refused((done.code, done.out, done.err), 4, found.key)
+
+
+def outside_checkpoint(store, key, outside):
+    (store.root / ".work" / key).mkdir()
+    (store.root / ".work" / key / "checkpoint").symlink_to(outside / "precious")
+
+
+def checkpoint_pipe(store, key, outside):
+    (store.root / ".work" / key).mkdir()
+    os.mkfifo(store.root / ".work" / key / "checkpoint")
+
+
+def checkpoint_directory(store, key, outside):
+    (store.root / ".work" / key / "checkpoint" / "below").mkdir(parents=True)
+
+
+def endless_checkpoint(store, key, outside):
+    (store.root / ".work" / key).mkdir()
+    with open(store.root / ".work" / key / "checkpoint", "wb") as file:
+        file.truncate(1 << 40)
+
+
+def odd_leftovers(store, key, outside):
+    node = os.uname().nodename
+    (store.root / ".work" / key).mkdir()
+    for pid in ("x", "9" * 40):
+        (store.root / ".work" / key / f"out.{pid}.{'0' * 32}.{node}").mkdir()
+    # 2 ** 22 is the largest process number there can be.
+    (store.root / ".work" / key / f"out.{2**22 + 1}.{'0' * 32}.{node}").symlink_to(outside)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        outside_checkpoint,
+        checkpoint_pipe,
+        checkpoint_directory,
+        endless_checkpoint,
+        odd_leftovers,
+    ],
+)
+def test_what_lies_in_the_scratch_directory_is_not_followed(irl, store_copy, tmp_path, plant):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_text("kept")
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    (store.root / ".keys" / key).unlink()
+    plant(store, key, outside)
+    done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
+    assert Path(done.out.strip()).name == store_copy.transfer, done.err
+    assert ("cannot be used" in done.err) == ("checkpoint" in plant.__name__)
+    assert (outside / "precious").read_text() == "kept"
+
+
+@pytest.mark.parametrize("name", [".keys", ".names", ".work", ".locks", ".quarantine"])
+def test_a_store_does_not_lead_out_of_itself(irl, store_copy, tmp_path, name):
+    outside = tmp_path / "outside"
+    (store_copy.path / name).rename(outside)
+    (store_copy.path / name).symlink_to(outside)
+    before = sorted(outside.rglob("*"))
+    for line in (["gc", "--delete", "--grace-days", "0"], [*CHAIN[2], *SMOKE, "--name", "x"]):
+        done = irl(*line, "--store", store_copy.path)
+        assert_refused((done.code, done.out, done.err), 4, f"{name} is a symbolic link")
+    assert sorted(outside.rglob("*")) == before
+
+
+def test_a_scratch_directory_a_lock_a_name_and_a_claim_that_lead_out(irl, store_copy, tmp_path):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_text("kept" * 10)
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    claim, lock, work = (store.root / part / key for part in (".keys", ".locks", ".work"))
+    claim.unlink()
+    work.symlink_to(outside)
+    again = [*CHAIN[2], *SMOKE, "--store", store.root]
+    done = irl(*again)
+    assert_refused((done.code, done.out, done.err), 4, f"{work} is not a directory")
+    assert irl("gc", "--delete", "--grace-days", "0", "--store", store.root).code == 0
+    assert not work.is_symlink()
+    lock.unlink(missing_ok=True)
+    lock.symlink_to(outside / "precious")
+    assert irl(*again).code != 0
+    lock.unlink()
+    for pointer in (claim, store.root / ".names" / "led-out"):
+        pointer.symlink_to(outside / "precious")
+    assert irl("show", "led-out", "--store", store.root).code == 3
+    done = irl(*again)
+    assert Path(done.out.strip()).name == store_copy.transfer, done.err
+    assert (outside / "precious").read_text() == "kept" * 10
 
 
 def planted(store: Store, source: str, name: str, data: bytes) -> None:

@@ -133,6 +133,10 @@ def solve(
     )
 
 
+class UnfitState(ValueError):
+    """A state to go on from that no such fit was in."""
+
+
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
     """The demonstrations of one run in E settings, as state and action indices.
@@ -361,7 +365,8 @@ def fit(
 
     Raises:
         ValueError: shapes that do not fit; weights, penalty weights or l2 negative or NaN; a
-            horizon, discount, width, rate or number of iterations out of range.
+            horizon, discount, width, rate or number of iterations out of range; a ``state`` of
+            another fit (:class:`UnfitState`).
         UsageError: an unknown penalty.
     """
     e, n, _ = settings.shape
@@ -394,11 +399,15 @@ def fit(
     solution = None
     done = 0
     if state is not None:
-        done = state["iterations"]
-        networks.load_state_dict(state["networks"])
-        optimizer.load_state_dict(state["optimizer"])
-        steps, *columns = (column.numpy() for column in state["records"])
-        records = list(zip(steps.tolist(), *columns, strict=True))
+        try:
+            done = int(state["iterations"])
+            networks.load_state_dict(state["networks"])
+            optimizer.load_state_dict(state["optimizer"])
+            steps, objective, penalties, gaps = (column.numpy() for column in state["records"])
+            records = list(zip(steps.tolist(), objective, penalties, gaps, strict=True))
+        except Exception as error:
+            # Whatever a crafted state makes torch and Python raise.
+            raise UnfitState(f"no such fit was in this state ({type(error).__name__})") from error
 
     def snapshot() -> dict[str, Any]:
         # A tensor a column: their number does not grow with the iterations.

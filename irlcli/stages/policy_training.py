@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from irlcli import checkpoints
-from irlcli.errors import IntegrityError
 from irlcli.rl import PPOTrainer, RewardFunction, Rollout, world_groups
 from irlcli.stages import Job
 from irlcli.stages.adversary import Adversary
@@ -70,25 +69,15 @@ def _resume(
     selection: Selection | None,
     state: Row,
 ) -> tuple[int, list[Row]]:
-    """Number of rounds done and their rows; all go on from ``state``.
-
-    Raises:
-        IntegrityError: a state that somebody made, or another version of the program.
-    """
-    try:
+    """Number of rounds done and their rows; all go on from ``state``."""
+    # Whatever a crafted state makes torch and Python raise.
+    with checkpoints.fitting(job.output.parent, Exception):
         trainer.load_state_dict(state["trainer"])
         if adversary is not None:
             adversary.load_state_dict(state["adversary"])
         if selection is not None:
             selection.load_state_dict(state["selection"])
         return int(state["round"]), list(json.loads(state["rows"].numpy().tobytes()))
-    except Exception as error:
-        # Whatever a crafted state makes torch and Python raise.
-        raise IntegrityError(
-            f"the checkpoint in {job.output.parent} does not fit its stage "
-            f"({type(error).__name__})",
-            "remove that directory, then run the same command again to start over",
-        ) from None
 
 
 def _state(

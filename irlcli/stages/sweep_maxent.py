@@ -132,7 +132,8 @@ def run(job: Job) -> None:
             occupancy[shuffled].append(maxent.expert_occupancy(settings, demos, grid.horizon))
     found = list(variants(p.penalty_weights, p.l2s))
     state = checkpoints.restore(job.checkpoints.load(), {"rewards", "fit"}, job.console.warn)
-    rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
+    with checkpoints.fitting(job.output.parent, Exception):
+        rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
     while len(rewards) < len(PENALTIES):
         penalty = PENALTIES[len(rewards)]
         chosen = [v for v in found if v.penalty == penalty]
@@ -194,7 +195,7 @@ def _fit(job, settings, seeds, runs, occupancy, counts, rewards, state):
             )
         )
 
-    with gridworlds.usable_input():
+    with gridworlds.usable_input(), checkpoints.fitting(job.output.parent, maxent.UnfitState):
         return maxent.fit(
             settings,
             gridworlds.inputs(m.inputs, p.gridworld),

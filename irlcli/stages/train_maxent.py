@@ -67,7 +67,7 @@ def run(job: Job) -> None:
         job.checkpoints.offer(lambda: checkpoints.to_bytes(state()))
 
     names = {"iterations", "networks", "optimizer", "records"}
-    with gridworlds.usable_input():
+    with gridworlds.usable_input(), checkpoints.fitting(job.output.parent, maxent.UnfitState):
         fit = maxent.fit(
             settings,
             gridworlds.inputs(m.inputs, grid),

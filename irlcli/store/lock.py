@@ -32,7 +32,7 @@ def locked(
     """
     # A shared lock needs no write permission: a store that may only be read can be read safely.
     access = os.O_RDONLY if shared else os.O_RDWR
-    descriptor = os.open(path, access | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = os.open(path, access | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
         mode = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
         try:

@@ -6,12 +6,15 @@ import hashlib
 import os
 import re
 import shutil
+import stat
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 CHECKPOINT = "checkpoint"
+# The largest that a stage writes are some tens of MB.
+_MAX_BYTES = 1 << 30
 
 
 def fsync_directory(path: Path) -> None:
@@ -57,12 +60,17 @@ def remove_leftovers(directory: Path) -> None:
     """Remove what dead processes of this machine left half-written in ``directory``."""
     node = re.escape(os.uname().nodename)
     for path in directory.iterdir():
-        owner = re.fullmatch(rf".+\.(\d+)\.[0-9a-f]{{32}}\.{node}", path.name)
+        owner = re.fullmatch(rf".+\.(\d{{1,9}})\.[0-9a-f]{{32}}\.{node}", path.name)
         if owner and not _alive(int(owner[1])):
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+            remove(path)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link (not what it points to) or a directory with all that is in it."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 class Scratch:
@@ -83,8 +91,12 @@ class Scratch:
             ValueError: the checkpoint's bytes are not those that were saved.
         """
         path = self.directory / CHECKPOINT
-        if not path.exists():
+        try:
+            information = path.lstat()
+        except FileNotFoundError:
             return None
+        if not stat.S_ISREG(information.st_mode) or information.st_size > _MAX_BYTES:
+            raise ValueError(f"{path} is not one that was written here")
         stored = path.read_bytes()
         if hashlib.sha256(stored[32:]).digest() != stored[:32]:
             raise ValueError(f"{path} is damaged")
@@ -92,7 +104,7 @@ class Scratch:
 
     def discard_checkpoint(self) -> None:
         """Forget the checkpoint: the stage starts over."""
-        (self.directory / CHECKPOINT).unlink(missing_ok=True)
+        remove(self.directory / CHECKPOINT)
 
     def new_output(self) -> Path:
         """An empty directory for one attempt's outputs; what dead processes left is removed."""

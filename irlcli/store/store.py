@@ -55,6 +55,7 @@ from irlcli.store.manifest import (
 from irlcli.store.scratch import (
     Scratch,
     fsync_directory,
+    remove,
     remove_leftovers,
     temporary_file,
     write_durably,
@@ -177,6 +178,12 @@ class Store:
                 f"{self.root} has files in it but is no store",
                 "name an empty or a new directory with --store",
             )
+        for name in _OWN:
+            if (self.root / name).is_symlink():
+                # What is written, moved and removed there stays inside the store.
+                raise IntegrityError(
+                    f"{self.root / name} is a symbolic link", "replace it by a directory"
+                )
 
     # Layout
 
@@ -237,11 +244,8 @@ class Store:
 
         Where it was removed, or the pointer damaged, computing again repairs both.
         """
-        try:
-            name = (self._keys() / key).read_text("ascii").strip()
-        except (FileNotFoundError, UnicodeDecodeError, IsADirectoryError):
-            return None
-        return name if re.fullmatch(_ID, name) and (self.root / name).is_dir() else None
+        name = _pointed_to(self._keys() / key)
+        return name if name is not None and (self.root / name).is_dir() else None
 
     def get(self, id16: str) -> Artefact:
         """The artefact in directory ``id16``, its manifest checked against that address.
@@ -320,11 +324,7 @@ class Store:
 
     def _named(self, name: str) -> str | None:
         """The id that ``name`` stands for; one file is read, however many names there are."""
-        path = self._names() / name
-        if not re.fullmatch(_NAME, name) or not path.is_file():
-            return None
-        id16 = path.read_text("utf-8", "replace").strip()
-        return id16 if re.fullmatch(_ID, id16) else None
+        return _pointed_to(self._names() / name) if re.fullmatch(_NAME, name) else None
 
     # References
 
@@ -434,9 +434,13 @@ class Store:
 
         Raises:
             Busy: another process holds it and ``wait`` is false.
+            IntegrityError: something else lies where the directory would be.
         """
         with locked(self._locks() / key, wait=wait, on_wait=on_wait):
-            yield Scratch(self._work() / key)
+            directory = self._work() / key
+            if os.path.lexists(directory) and (directory.is_symlink() or not directory.is_dir()):
+                raise IntegrityError(f"{directory} is not a directory", "remove it")
+            yield Scratch(directory)
 
     def has_checkpoint(self, key: str) -> bool:
         """Whether an interrupted run of ``key`` left something to go on from."""
@@ -697,7 +701,7 @@ class Store:
                 artefact.directory.rename(grave)
                 shutil.rmtree(grave)
             for path in work:
-                shutil.rmtree(path)
+                remove(path)
                 (self._locks() / path.name).unlink(missing_ok=True)
             for directory in (self.root, self._keys(), self._names()):
                 remove_leftovers(directory)
@@ -715,10 +719,23 @@ def _recorded_command(directory: Path) -> str:
 
 
 def _pointers(keys: Path) -> Iterator[tuple[Path, str]]:
-    """The claims, and the id that each leads to, without trusting any manifest."""
+    """The claims that lead to an id, and that id, without trusting any manifest."""
     for path in keys.iterdir():
-        if re.fullmatch(_KEY, path.name) and path.is_file():
-            yield path, path.read_bytes().strip().decode("ascii", "replace")
+        id16 = _pointed_to(path)
+        if re.fullmatch(_KEY, path.name) and id16 is not None:
+            yield path, id16
+
+
+def _pointed_to(path: Path) -> str | None:
+    """The id that a name or a claim holds; None for anything else, however large."""
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return None
+        with open(path, "rb") as file:
+            text = file.read(2 * _ID_DIGITS).decode("ascii").strip()
+    except (FileNotFoundError, UnicodeDecodeError):
+        return None
+    return text if re.fullmatch(_ID, text) else None
 
 
 def _has_size(path: Path, size: int) -> bool:
