@@ -1,5 +1,6 @@
-# Two set-up commands: `make demo` and `make test`. Results: `make table1 figure2 figure3 figure4
-# table2`, or `make all-results`; `make report-table1` reports on what is there and runs nothing.
+# Two set-up commands: `make demo` and `make test`. Results: `make experts table1 figure2 figure3
+# figure4 table2`, or `make all-results`; `make report-table1` reports on what is there and runs
+# nothing.
 #
 #   PROFILE=smoke|standard|paper   budgets (settings/)
 #   SEEDS="0 1 2"                  seeds of the reward learning
@@ -26,7 +27,7 @@ COMMON   = --store $(STORE) --profile $(PROFILE) $(SET)
 READY   := $(VENV)/.installed
 
 .DELETE_ON_ERROR:
-.PHONY: demo test bench torture all-results table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
+.PHONY: demo test bench torture all-results experts table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -70,8 +71,15 @@ TABLE1  := lunar-lander.bounce lunar-lander.engine-power ant.friction ant.leg-le
 FIGURE3 := ant.leg-length half-cheetah.friction reacher.gravity
 FIGURE4 := ant.goal-y half-cheetah.goal-y
 
-all-results: table1 figure2 figure3 figure4 table2
+# The expert of every setting, and what the random and the idle agent earn there.
+EXPERTS := $(addprefix lunar-lander.,bounce friction engine-power) \
+    $(addprefix ant.,mass friction leg-length goal-y direction) \
+    $(addprefix half-cheetah.,mass friction leg-length goal-y direction) reacher.gravity
 
+all-results: experts table1 figure2 figure3 figure4 table2
+
+experts: $(addsuffix .experts,$(EXPERTS))
+	$(REPORT_EXPERTS)
 table1: $(addsuffix .returns,$(TABLE1)) $(addsuffix .id-returns,$(TABLE1))
 	$(REPORT)
 table1-lunar-lander: $(foreach row,$(filter lunar-lander.%,$(TABLE1)),$(row).returns $(row).id-returns)
@@ -86,6 +94,16 @@ REPORTS := $(addprefix report-,table1 table1-lunar-lander figure3 figure4)
 .PHONY: $(REPORTS)
 $(REPORTS): $(READY)
 	$(REPORT)
+
+.PHONY: report-experts
+report-experts: $(READY)
+	$(REPORT_EXPERTS)
+
+define REPORT_EXPERTS
+@mkdir -p $(RESULTS)
+made=$$($(RUN) $(IRL) report experts $(COMMON) --name $(TAG).experts) && \
+  install -m 644 $$made/README.md $$made/experts.csv $$made/experts.png $(RESULTS)
+endef
 
 # Of the target's name: the report (what follows a dash is an environment), and where its files go.
 WHAT    = $(patsubst report-%,%,$@)
@@ -161,6 +179,16 @@ $(1).expert-id-returns: $(NAMES)/$(TAG).$(1).demos
 $$(foreach m,$(METHODS),$$(foreach s,$(SEEDS),$$(eval $$(call CELL,$(TAG).$(1).$$(m).$$(s),$(TAG).$(1),$(3),$$(m),$$(s)))))
 endef
 
+# $(1) ENV.KNOB, $(2) ENV, $(3) KNOB
+define EXPERTS_OF
+.PHONY: $(1).experts
+$(1).experts: $(READY)
+	$$(RUN) $(IRL) evaluate --expert --env $(2) --intervention $(3) $$(COMMON)
+	$$(RUN) $(IRL) evaluate --expert --env $(2) --ood $(3) $$(COMMON)
+	@for agent in random idle; do for use in intervention ood; do \
+	    $$(RUN) $(IRL) evaluate --$$$$agent --env $(2) --$$$$use $(3) $$(COMMON) || exit; done; done
+endef
+
 # $(1) name, $(2) name of the row, $(3) KNOB, $(4) method, $(5) seed
 define CELL
 $(NAMES)/$(1): $(NAMES)/$(2).demos FORCE
@@ -182,6 +210,9 @@ endef
 
 $(foreach row,$(sort $(TABLE1) $(FIGURE3) $(FIGURE4)),$(eval \
     $(call ROW,$(row),$(firstword $(subst ., ,$(row))),$(lastword $(subst ., ,$(row))))))
+
+$(foreach row,$(EXPERTS),$(eval \
+    $(call EXPERTS_OF,$(row),$(firstword $(subst ., ,$(row))),$(lastword $(subst ., ,$(row))))))
 
 FORCE:
 

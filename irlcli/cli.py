@@ -13,7 +13,7 @@ import typer
 from irlcli import console as out
 from irlcli.errors import IntegrityError, Interrupted, IrlError, NotFound, StageFailed, UsageError
 
-_REPORTS = "returns, table1, figure2, figure3, figure4, table2"
+_REPORTS = "returns, experts, table1, figure2, figure3, figure4, table2"
 _COMMANDS: dict[str, tuple[Callable, bool]] = {}
 
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
@@ -845,7 +845,9 @@ def report(
         "--env": env,
         "--choose-penalty": choose_penalty,
     }
-    if kind in ("returns", "figure2", "table2"):
+    if kind == "experts":
+        _refuse(kind, {**compared, "--env": None, "--format": form})
+    elif kind in ("returns", "figure2", "table2"):
         _refuse(kind, {**compared, "--format": form if kind != "table2" else None})
     else:
         _refuse(kind, {"--format": form})
@@ -859,6 +861,8 @@ def report(
         _print_returns(session, refs)
     elif kind == "figure2":
         _report_figure2(session, name)
+    elif kind == "experts":
+        _report_experts(session, env, name)
     elif kind == "table2":
         _print_table2(session, form or "text")
     else:
@@ -893,9 +897,7 @@ def _report_experiment(
         raise UsageError(f"--seeds {seeds!r} is no list of seeds", "write 0,1,2,3,4") from None
     if min(numbers) < 0:
         raise UsageError(f"--seeds {seeds!r}: no seed -1 or below", "seeds are 0 or more")
-    words = ["irl", "report", kind, "--profile", session.profile]
-    words += [] if session.settings_file is None else ["--settings", str(session.settings_file)]
-    words += [word for item in session.overrides for word in ("--set", item)]
+    words = _words(session, kind)
     words += ["--seeds", ",".join(map(str, numbers)), "--methods", ",".join(chosen)]
     words += [] if env is None else ["--env", env]
     candidates: Sequence[float] = ()
@@ -915,6 +917,31 @@ def _report_experiment(
     for artefact in session.deliver([request], name, table=f"{kind}.json"):
         if not session.as_json:
             _print_report(read_json(session.store.open(artefact, f"{kind}.json")))
+
+
+def _words(session: Session, kind: str) -> list[str]:
+    """The command line that asks for report ``kind`` under the same settings again."""
+    words = ["irl", "report", kind, "--profile", session.profile]
+    words += [] if session.settings_file is None else ["--settings", str(session.settings_file)]
+    return words + [word for item in session.overrides for word in ("--set", item)]
+
+
+def _report_experts(session: Session, env: str | None, name: str | None) -> None:
+    import shlex
+
+    from irlcli import experiments
+    from irlcli.interventions import ENVIRONMENTS, check_tabular
+    from irlcli.runner import Runner
+    from irlcli.store import read_json
+
+    words = _words(session, "experts") + ([] if env is None else ["--env", env])
+    if env is not None:
+        check_tabular(env, "report experts", wanted=False)
+    envs = [e.name for e in ENVIRONMENTS.values() if env in (None, e.name) and not e.tabular]
+    request = experiments.experts(Runner(session.store), session.settings, shlex.join(words), envs)
+    for artefact in session.deliver([request], name, table="experts.json"):
+        if not session.as_json:
+            _print_report(read_json(session.store.open(artefact, "experts.json")))
 
 
 def _print_report(report: dict[str, Any]) -> None:

@@ -131,7 +131,10 @@ class Returns(Struct, frozen=True, kw_only=True):
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
     mean_return: Finite
+    std_return: Finite | None = None
     mean_progress: Finite | None = None
+    mean_length: Finite | None = None
+    terminated: Finite | None = None
 
 
 class Evaluation(Struct, frozen=True, kw_only=True):

@@ -26,6 +26,7 @@ from irlcli.stages import (
     train_expert,
     transfer,
 )
+from irlcli.stages import experts as stages_experts
 from irlcli.store import Artefact, Resolved, digest, read_json
 
 METHODS = ("erm", "irm", "erm-balanced", "irm-shuffled")
@@ -163,6 +164,60 @@ def request(
         others=tuple(_others(runner.store.artefacts(), expected, set(runs))),
     )
     return results.request(parameters, sources)
+
+
+def experts(
+    runner: Runner,
+    settings: Callable[[str, Mapping[str, Any] | None], Settings],
+    command: str,
+    envs: Sequence[str],
+) -> Request:
+    """The report on the experts of every setting that ``settings`` lists for ``envs``.
+
+    Raises:
+        NotFound: the store holds none of them.
+    """
+    plan = _Plans(runner)
+    cells, runs, sources, budgets = [], {}, {}, {}
+    for env in envs:
+        config = settings(env, None)
+        budgets[env] = config.expert.total_steps
+        for knob, listed in config.interventions.items():
+            for measure, values in (("id", listed.id), ("ood", listed.ood)):
+                places = parse_settings(env, f"{knob}={','.join(values)}")
+                wanted = [
+                    (agent, "", evaluate.request(env, places, config.evaluation, agent=agent))
+                    for agent in ("random", "idle")
+                ]
+                for place in places:
+                    learned = train_expert.request(env, place, 0, config.expert)
+                    made = plan(learned)[-1].artefact
+                    if made is not None:
+                        role = f"{env} {place} learning"
+                        sources[role] = _output(made, "metrics.parquet")
+                    policy = From(learned, "policy.pt")
+                    measured = evaluate.request(env, [place], config.evaluation, policy)
+                    wanted.append(("expert", str(place), measured))
+                for agent, place, measured in wanted:
+                    steps = plan(measured)
+                    cell = results.Cell(f"{env} {knob}", agent, measure, place=place)
+                    cells.append(_placed(cell, steps))
+                    for step in steps:
+                        if step.artefact is not None:
+                            runs[step.artefact.id] = step.artefact
+                    found = steps[-1].artefact
+                    if found is not None:
+                        sources[cells[-1].role] = source_of(Resolved(found, found.directory))
+    if not any(cell.run for cell in cells if cell.agent == "expert"):
+        raise NotFound(
+            f"{runner.store.root} holds no evaluation of an expert of these settings",
+            "`make experts` makes them; --profile and --set must be those of the runs",
+        )
+    facts, _ = _facts(runs.values())
+    parameters = stages_experts.Parameters(
+        command=command, steps=budgets, cells=tuple(cells), runs=facts
+    )
+    return stages_experts.request(parameters, sources)
 
 
 class _Learner(NamedTuple):

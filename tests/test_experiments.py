@@ -277,3 +277,49 @@ def test_goal_demonstrations_favour_the_right(irl, tmp_path):
     assert dict(zip(listed.id, listed.episodes, strict=True)) == {"-900": 10, "0": 3}
     refused = irl(*collect, "goal-y", "--episodes", "1,2,3", *plan)
     assert refused.code == 2 and "3 episode counts for 2 settings" in refused.err
+
+
+def test_the_experts_of_every_setting(irl, table_store, tmp_path):
+    """What is there is said as the evaluations say it, what is not is named."""
+    common = ["--store", table_store, "--profile", "smoke", *SMALL]
+    done = irl("report", "experts", *ROW, *common, "--name", "experts")
+    assert done.code == 0, done.err
+    directory = Path(done.out.strip())
+    found = pd.read_csv(directory / "experts.csv").set_index("setting")
+    assert set(found["env"]) == {"lunar-lander"}
+    assert set(found.index[found["use"] == "held out"]) == {
+        f"{knob}={value}"
+        for knob, listed in load_settings("lunar-lander", "smoke").interventions.items()
+        for value in listed.ood
+    }
+    row = found.loc["engine-power=1.5x"]
+    for agent, name in (
+        ("expert", "true_return"),
+        ("idle", "idle_return"),
+        ("random", "random_return"),
+    ):
+        evaluated = irl("evaluate", f"--{agent}", *ROW, "--ood", "engine-power", *common)
+        (place,) = json.loads((Path(evaluated.out.split()[0]) / "summary.json").read_text())[
+            "settings"
+        ]
+        assert row[name] == pytest.approx(place["mean_return"], rel=1e-5)
+    assert (row["steps"], row["episodes"], row["stands"]) == (1024, 2, "done")
+    assert found.loc["bounce=0.9", "stands"] == "train-expert has not run"
+    assert pd.isna(found.loc["bounce=0.9", "true_return"])
+    (missing,) = notes(done)
+    assert missing.startswith("Missing: 6 of 9 experts: lunar-lander bounce=0.1")
+    assert (
+        "| lunar-lander bounce=0.9 | held out | train-expert has not run |"
+        in (directory / "README.md").read_text()
+    )
+    again = irl("report", "experts", *ROW, *common)
+    assert again.out == done.out and "HIT" in again.err
+
+
+def test_no_experts(irl, tmp_path):
+    empty = irl("report", "experts", *ROW, "--store", tmp_path / "runs")
+    assert empty.code == 3 and "make experts" in empty.err
+    tabular = irl("report", "experts", "--env", "gridworld", "--store", tmp_path / "runs")
+    assert tabular.code == 2 and "gridworld" in tabular.err
+    refused = irl("report", "experts", "--seeds", "0", "--store", tmp_path / "runs")
+    assert refused.code == 2 and "--seeds" in refused.err

@@ -142,14 +142,14 @@ def interrupted(arguments, count):
     for _ in range(count):
         process.send_signal(signal.SIGINT)
         time.sleep(0.05)
-    _, errors = process.communicate(timeout=120)
+    _, errors = process.communicate(timeout=400)
     return process.returncode, errors
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count):
     arguments = ["evaluate", "--random", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
-    arguments += ["--episodes", "3000", "--store", str(tmp_path / "runs")]
+    arguments += ["--episodes", "1500", "--store", str(tmp_path / "runs")]
     code, errors = interrupted(arguments, count)
     assert code == 130
     assert "error:" in errors and "hint:" in errors and "Traceback" not in errors

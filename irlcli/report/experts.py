@@ -1,0 +1,162 @@
+"""The experts' table and their learning curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import pandas as pd
+
+from irlcli.report.results import duration
+from irlcli.report.tables import markdown_table
+
+_TITLE = "Experts: true return in their own settings"
+_NOTE = (
+    "Mean true return of whole episodes, and the mean progress in the direction of the goal where "
+    "the environment has one: a robot that stands still is paid for being alive. Random and idle "
+    "are agents that learn nothing. Minutes are one process's on a machine that others shared."
+)
+
+
+def table(
+    cells: Sequence[Any],
+    runs: Mapping[str, Any],
+    steps: Mapping[str, int],
+    summaries: Mapping[tuple[str, str, str], Any],
+) -> pd.DataFrame:
+    """A row per setting: what expert, idle and random agent earn there, and the expert's training.
+
+    Args:
+        cells: those of ``stages.experts.Parameters``.
+        runs: facts by id; an evaluation's only input is its policy.
+        steps: an expert's budget, by environment.
+        summaries: evaluated settings by (agent, environment, setting); those missing are not there.
+    """
+    rows = []
+    for cell in cells:
+        if cell.agent != "expert":
+            continue
+        env, knob = cell.row.split()
+        expert, idle, random = (
+            summaries.get((agent, env, cell.place)) for agent in ("expert", "idle", "random")
+        )
+        learned = [runs[i] for i in runs[cell.run].inputs if i in runs] if cell.run else []
+        row = {
+            "env": env,
+            "knob": knob,
+            "setting": cell.place,
+            "use": {"id": "trained in", "ood": "held out"}[cell.measure],
+            "true_return": _value(expert, "mean_return"),
+            "std_return": _value(expert, "std_return"),
+            "progress": _value(expert, "mean_progress"),
+            "length": _value(expert, "mean_length"),
+            "terminated": _value(expert, "terminated"),
+            "episodes": _value(expert, "episodes"),
+            "idle_return": _value(idle, "mean_return"),
+            "random_return": _value(random, "mean_return"),
+            "steps": steps[env],
+            "seconds": learned[0].seconds if learned else None,
+            "resumed": learned[0].resumed if learned else None,
+            "commit": learned[0].commit if learned else None,
+            "stands": "done" if cell.run else cell.why,
+        }
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def text_table(found: pd.DataFrame) -> dict[str, Any]:
+    """``table`` for people: title, note, columns and rows of text."""
+    columns = ["setting", "use", "expert", "progress", "idle", "random", "steps", "took", "commit"]
+    rows = []
+    for row in found.itertuples():
+        value = f"{_text(row.true_return)} ± {_text(row.std_return)}"
+        took = "-" if pd.isna(row.seconds) else duration(row.seconds)
+        if not pd.isna(row.resumed) and row.resumed > 0:
+            took += f", resumed {row.resumed:.0f}x"
+        rows.append(
+            [
+                f"{row.env} {row.setting}",
+                row.use,
+                value if row.stands == "done" else row.stands,
+                *(_text(v) for v in (row.progress, row.idle_return, row.random_return)),
+                f"{row.steps:,}",
+                took,
+                row.commit[:10] if isinstance(row.commit, str) else "-",
+            ]
+        )
+    return {"title": _TITLE, "note": _NOTE, "columns": columns, "rows": rows}
+
+
+def notes(cells: Sequence[Any]) -> list[str]:
+    """What is missing."""
+    experts = [cell for cell in cells if cell.agent == "expert"]
+    missing = [f"{cell.row.split()[0]} {cell.place}" for cell in experts if not cell.run]
+    if not missing:
+        return []
+    return [f"Missing: {len(missing)} of {len(experts)} experts: {', '.join(missing)}."]
+
+
+def markdown(command: str, text: Mapping[str, Any], said: Sequence[str]) -> str:
+    """The page."""
+    return "\n".join(
+        [
+            f"# {text['title']}\n",
+            f"`{command}`\n",
+            *(f"- {note}\n" for note in said),
+            markdown_table(text["columns"], text["rows"]),
+            f"± standard deviation over episodes. {text['note']}\n",
+            "![learning curves](experts.png)\n",
+            "Learning curves: episodes of a policy that explores; held-out settings are dashed.\n",
+            "`experts.csv` has a row per setting.\n",
+        ]
+    )
+
+
+def draw(directory: Path, cells: Sequence[Any], learning: Mapping[str, pd.DataFrame]) -> None:
+    """Write ``experts.png`` and ``experts.pdf``: return and progress of every expert over steps.
+
+    ``learning`` maps ``ENV SETTING learning`` to an expert's metrics.
+    """
+    curves: dict[str, list[tuple[Any, pd.DataFrame]]] = {}
+    for cell in cells:
+        metrics = learning.get(f"{cell.row.split()[0]} {cell.place} learning")
+        if cell.agent == "expert" and metrics is not None:
+            curves.setdefault(cell.row, []).append((cell, metrics))
+    with plt.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
+        size = (9, 0.4 + 1.9 * len(curves))
+        figure, axes = plt.subplots(
+            len(curves), 2, figsize=size, squeeze=False, layout="constrained"
+        )
+        for line, (row, experts) in zip(axes, curves.items(), strict=True):
+            for axis, name in zip(line, ("true_return", "progress"), strict=True):
+                _panel(axis, f"{row}: {name.replace('_', ' ')}", name, experts)
+            line[0].legend(frameon=False, fontsize=7)
+        figure.savefig(directory / "experts.png", dpi=110)
+        figure.savefig(directory / "experts.pdf", metadata={"CreationDate": None})
+        plt.close(figure)
+
+
+def _panel(axis, title: str, name: str, experts: Sequence[tuple[Any, pd.DataFrame]]) -> None:
+    if not any(metrics[name].notna().any() for _, metrics in experts):
+        axis.set_axis_off()
+        return
+    for cell, metrics in experts:
+        style = "-" if cell.measure == "id" else "--"
+        axis.plot(metrics["steps"] / 1e6, metrics[name], style, lw=1.2, label=cell.place)
+    axis.set_title(title, loc="left", size=8)
+    axis.set_xlabel("million steps")
+    axis.grid(alpha=0.25)
+
+
+def _value(place: Any, name: str) -> float | None:
+    return None if place is None else getattr(place, name)
+
+
+def _text(value: Any) -> str:
+    return "-" if pd.isna(value) else f"{value:,.0f}"

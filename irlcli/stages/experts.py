@@ -1,0 +1,71 @@
+"""What the experts of every setting earn, how they learned, and where their training stands.
+
+Its inputs are evaluations and learning curves, known by their content. Which run on which commit
+took how long are parameters, so that equal requests give equal bytes.
+"""
+
+from collections.abc import Mapping
+
+import msgspec
+
+from irlcli.stages import Job, Request, Source, Stage
+from irlcli.stages.results import Cell, Run
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What the report depends on, besides its evaluations and learning curves.
+
+    Attributes:
+        command: how to ask for it again; printed in it.
+        steps: the budget of an expert, by environment.
+        cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``; each ``place`` is a setting.
+        runs: facts on the artefacts, by id.
+    """
+
+    command: str
+    steps: dict[str, int]
+    cells: tuple[Cell, ...]
+    runs: dict[str, Run]
+
+
+def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
+    """The report on ``sources``: evaluations by :attr:`Cell.role`, and ``metrics.parquet`` files.
+
+    The latter are ``ENV SETTING learning``. Outputs ``README.md``, ``experts.csv`` (a row per
+    setting), ``experts.json``, ``experts.png`` and ``experts.pdf``.
+    """
+    return Request(STAGE, parameters, dict(sources), "report experts")
+
+
+def run(job: Job) -> None:
+    """Read the evaluations and curves, and lay them out."""
+    import pandas as pd
+
+    from irlcli import descriptions
+    from irlcli.report import experts
+    from irlcli.stages.outputs import write_json
+    from irlcli.store import read_json
+
+    p: Parameters = job.parameters
+    summaries = {}
+    for cell in p.cells:
+        if cell.run:
+            path = job.inputs[cell.role] / "summary.json"
+            summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
+            for place in summary.settings:
+                summaries[cell.agent, summary.policy.env, place.setting] = place
+    learning = {
+        role: pd.read_parquet(path)
+        for role, path in job.inputs.items()
+        if role.endswith(" learning")
+    }
+    found = experts.table(p.cells, p.runs, p.steps, summaries)
+    text = experts.text_table(found)
+    notes = experts.notes(p.cells)
+    found.to_csv(job.output / "experts.csv", index=False, float_format="%.6g", lineterminator="\n")
+    write_json(job.output / "experts.json", {"tables": [text], "notes": notes})
+    (job.output / "README.md").write_text(experts.markdown(p.command, text, notes))
+    experts.draw(job.output, p.cells, learning)
+
+
+STAGE = Stage("report-experts", 1, run)
