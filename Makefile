@@ -48,7 +48,7 @@ bench: $(READY)
 	else echo "benchmarks.bullet_step was left out: it counts instructions with valgrind"; fi
 
 # The long form of tests/torture: a script a theme, each prints its figures. Takes an hour or more.
-TORTURE ?= crash concurrency growth
+TORTURE ?= crash concurrency growth determinism fuzz
 torture: $(READY)
 	@set -e; for theme in $(TORTURE); do $(VENV)/bin/python tests/torture/$$theme.py; done
 

@@ -1,6 +1,6 @@
-"""The short form of benchmarks/fuzz.py: changed inputs are taken or refused by one of our errors.
+"""The short form of fuzz.py: changed inputs are taken or refused by one of our errors.
 
-The long form follows coverage: ``python -m benchmarks.fuzz --seconds 600``.
+The long form follows coverage: ``make torture``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.fuzz import TARGETS, Coverage, mutate
+from fuzz import TARGETS, Coverage, mutate
 from irlcli.errors import IrlError
 from irlcli.interventions import parse_settings
 

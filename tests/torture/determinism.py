@@ -1,6 +1,6 @@
 """Every stage twice, in surroundings that must not matter: the ids have to be the same.
 
-    python -m benchmarks.determinism [--env ant ...]
+    python tests/torture/determinism.py [--env ant ...]
 
 The second time has two processes that step the environments, and another hash seed, locale, time zone,
 umask, number of threads, current directory and path of the store. Profile smoke. Exits 1 where an id

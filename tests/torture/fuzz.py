@@ -1,6 +1,6 @@
 """Coverage-guided fuzzing of everything that reads what others wrote.
 
-    python -m benchmarks.fuzz [--seconds 60] [--target NAME] [--seed 0]
+    python tests/torture/fuzz.py [--seconds 600] [--target NAME] [--seed 0]
 
 Inputs that reach new lines of irlcli are kept and mutated further, byte by byte. Every input must be
 taken or refused by one of the program's own errors: anything else, and an input that takes longer than
@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 from irlcli.errors import IrlError
 
-PACKAGE = str(Path(__file__).parent.parent / "irlcli")
+PACKAGE = str(Path(__file__).parent.parent.parent / "irlcli")
 SLOW_SECONDS = 10
 ADDRESS_SPACE = 8 << 30
 TOKENS = (
@@ -362,7 +362,7 @@ def fuzz(name: str, seconds: float, seed: int, place: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=60, help="in all; shared by the targets")
+    parser.add_argument("--seconds", type=float, default=600, help="in all; shared by the targets")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--target", choices=sorted(TARGETS), help="this one alone")
     parser.add_argument("--place", type=Path, help=argparse.SUPPRESS)
@@ -379,7 +379,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as place:
             words = ["--target", name, "--seed", str(options.seed), "--place", place]
             words += ["--seconds", str(options.seconds / len(names))]
-            code = subprocess.run([sys.executable, "-m", "benchmarks.fuzz", *words]).returncode
+            code = subprocess.run([sys.executable, __file__, *words]).returncode
             if code:
                 found += 1
                 given = (Path(place) / "input").read_bytes()
