@@ -9,10 +9,10 @@ import os
 import random
 
 import pytest
+from fuzz import TARGETS, Coverage, mutate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fuzz import TARGETS, Coverage, mutate
 from irlcli.errors import IrlError
 from irlcli.interventions import parse_settings
 
