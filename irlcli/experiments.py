@@ -178,10 +178,12 @@ def experts(
         NotFound: the store holds none of them.
     """
     plan = _Plans(runner)
-    cells, runs, sources, budgets = [], {}, {}, {}
+    cells, runs, sources, budgets, bars = [], {}, {}, {}, {}
     for env in envs:
         config = settings(env, None)
         budgets[env] = config.expert.total_steps
+        if config.expert.bar is not None:
+            bars[env] = config.expert.bar
         for knob, listed in config.interventions.items():
             for measure, values in (("id", listed.id), ("ood", listed.ood)):
                 places = parse_settings(env, f"{knob}={','.join(values)}")
@@ -215,7 +217,7 @@ def experts(
         )
     facts, _ = _facts(runs.values())
     parameters = stages_experts.Parameters(
-        command=command, steps=budgets, cells=tuple(cells), runs=facts
+        command=command, steps=budgets, bars=bars, cells=tuple(cells), runs=facts
     )
     return stages_experts.request(parameters, sources)
 

@@ -314,6 +314,9 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
     )
     again = irl("report", "experts", *ROW, *common)
     assert again.out == done.out and "HIT" in again.err
+    barred = irl("report", "experts", *ROW, *common, "--set", "expert.bar=1000")
+    (low, _) = notes(barred)
+    assert low.startswith("Below their bar") and "engine-power=1.5x" in low
 
 
 def test_no_experts(irl, tmp_path):

@@ -93,13 +93,19 @@ def text_table(found: pd.DataFrame) -> dict[str, Any]:
     return {"title": _TITLE, "note": _NOTE, "columns": columns, "rows": rows}
 
 
-def notes(cells: Sequence[Any]) -> list[str]:
-    """What is missing."""
+def notes(cells: Sequence[Any], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
+    """What is missing, and who earns less than an expert must."""
     experts = [cell for cell in cells if cell.agent == "expert"]
     missing = [f"{cell.row.split()[0]} {cell.place}" for cell in experts if not cell.run]
-    if not missing:
-        return []
-    return [f"Missing: {len(missing)} of {len(experts)} experts: {', '.join(missing)}."]
+    low = [
+        f"{row.env} {row.setting} ({row.true_return:.0f} of {bars[row.env]:.0f})"
+        for row in found.itertuples()
+        if row.env in bars and row.true_return < bars[row.env]
+    ]
+    said = [f"Below their bar, no experts yet: {', '.join(low)}."] if low else []
+    if missing:
+        said.append(f"Missing: {len(missing)} of {len(experts)} experts: {', '.join(missing)}.")
+    return said
 
 
 def markdown(command: str, text: Mapping[str, Any], said: Sequence[str]) -> str:

@@ -18,12 +18,14 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         command: how to ask for it again; printed in it.
         steps: the budget of an expert, by environment.
+        bars: the mean true return an expert must reach, by environment that has a bar.
         cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``; each ``place`` is a setting.
         runs: facts on the artefacts, by id.
     """
 
     command: str
     steps: dict[str, int]
+    bars: dict[str, float]
     cells: tuple[Cell, ...]
     runs: dict[str, Run]
 
@@ -61,7 +63,7 @@ def run(job: Job) -> None:
     }
     found = experts.table(p.cells, p.runs, p.steps, summaries)
     text = experts.text_table(found)
-    notes = experts.notes(p.cells)
+    notes = experts.notes(p.cells, found, p.bars)
     found.to_csv(job.output / "experts.csv", index=False, float_format="%.6g", lineterminator="\n")
     write_json(job.output / "experts.json", {"tables": [text], "notes": notes})
     (job.output / "README.md").write_text(experts.markdown(p.command, text, notes))
