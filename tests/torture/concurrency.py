@@ -186,7 +186,14 @@ def table_row(work: Path) -> dict[str, int]:
 
     root = work / "row"
     line = [
-        *("make", "-j8", "--no-print-directory", "-C", str(HERE.parent.parent), "row-engine-power"),
+        *(
+            "make",
+            "-j8",
+            "--no-print-directory",
+            "-C",
+            str(HERE.parent.parent),
+            "lunar-lander.engine-power.returns",
+        ),
         *(f"STORE={root}", "PROFILE=smoke", "SEEDS=0", "METHODS=erm irm"),
         *("READY=Makefile", f"IRL={sys.executable} -m irlcli"),
     ]
