@@ -7,6 +7,10 @@
 #   METHODS="erm irm"              of erm, irm, erm-balanced, irm-shuffled
 #   SET="--set FIELD=VALUE"        more settings, for every command
 #   CHOOSE="--choose-penalty 1,10" lambda of the penalised methods by leaving a setting out
+#   TAG=mine                       what the runs' names begin with: the profile, and with SET or
+#                                  CHOOSE yours to say, so that no run takes another's name
+#   RESULTS=DIR                    where a report's files go: docs/results/TARGET for the standard
+#                                  profile's own runs, else results/TAG/TARGET
 #   STORE=DIR                      artefact store
 #   RUN="srun -c2"                 put before every irl command, e.g. to spread over a cluster
 #
@@ -25,6 +29,13 @@ IRL     := $(VENV)/bin/irl
 NAMES   := $(STORE)/.names
 COMMON   = --store $(STORE) --profile $(PROFILE) $(SET)
 READY   := $(VENV)/.installed
+
+ifneq ($(strip $(SET)$(CHOOSE)),)
+ifndef TAG
+$(error SET and CHOOSE make other runs: say what to call them, e.g. TAG=mine)
+endif
+endif
+TAG ?= $(PROFILE)
 
 .DELETE_ON_ERROR:
 .PHONY: demo test bench torture all-results experts table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
@@ -100,8 +111,8 @@ report-experts: $(READY)
 	$(REPORT_EXPERTS)
 
 define REPORT_EXPERTS
-@mkdir -p $(RESULTS)
-made=$$($(RUN) $(IRL) report experts $(COMMON) --name $(TAG).experts) && \
+@set -e; made=$$($(RUN) $(IRL) report experts $(COMMON) --name $(TAG).experts); \
+  mkdir -p $(RESULTS); \
   install -m 644 $$made/README.md $$made/experts.csv $$made/experts.png $(RESULTS)
 endef
 
@@ -112,12 +123,12 @@ ENV     = $(patsubst $(KIND)-%,--env %,$(filter $(KIND)-%,$(WHAT)))
 COMMA  := ,
 SPACE  := $(subst ,, )
 LIST    = $(subst $(SPACE),$(COMMA),$(strip $(1)))
-RESULTS ?= docs/results/$(WHAT)
+RESULTS ?= $(if $(filter standard,$(TAG)),docs/results,results/$(TAG))/$(WHAT)
 
 define REPORT
-@mkdir -p $(RESULTS)
-made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(CHOOSE) $(ENV) --seeds $(call LIST,$(SEEDS)) \
-    --methods $(call LIST,$(METHODS)) --name $(TAG).$(WHAT)) && \
+@set -e; made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(CHOOSE) $(ENV) --seeds $(call LIST,$(SEEDS)) \
+    --methods $(call LIST,$(METHODS)) --name $(TAG).$(WHAT)); \
+  mkdir -p $(RESULTS); \
   install -m 644 $$made/README.md $$made/$(KIND).* $$made/seeds.csv $$made/comparisons.csv $(RESULTS)
 endef
 
@@ -146,7 +157,6 @@ figure2: $(READY)
 
 # A row: experts -> demonstrations -> AIRL per method and seed -> transfer -> returns. Its targets
 # are names in the store; ROW.returns and the like are those of a row together.
-TAG    ?= $(PROFILE)
 RUNS    = $(foreach m,$(2),$(foreach s,$(3),$(1).$(m).$(s)))
 AGENTS  = $(addprefix $(1),.expert-returns .random-returns .idle-returns)
 ZERO    = $(call AGENTS,$(1)) $(addsuffix .zero-shot-returns,$(call RUNS,$(1),$(2),$(3)))

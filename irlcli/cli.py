@@ -38,8 +38,10 @@ class Session:
         tensorboard: Path | None = None,
         workers: int = 1,
     ):
+        from irlcli.settings import check_profile
         from irlcli.store import Store
 
+        check_profile(profile)
         self.console = out.TerminalConsole(quiet, tensorboard)
         self.store = Store(store, self.console.warn)
         self.as_json = as_json
@@ -311,15 +313,16 @@ def train_airl(
 
 
 def _numbers(flag: str, text: str) -> list[float]:
-    import math
+    import msgspec
+
+    from irlcli.settings import NonNegative
 
     try:
-        numbers = [float(part) for part in text.split(",")]
-        if all(math.isfinite(x) and x >= 0 for x in numbers):
-            return numbers
-    except ValueError:
-        pass
-    raise UsageError(f"{flag} {text!r} is no list of numbers from 0 up", "write 0.1,1,10")
+        return msgspec.convert(text.split(","), list[NonNegative], strict=False)
+    except msgspec.ValidationError:
+        raise UsageError(
+            f"{flag} {text!r} is no list of numbers from 0 up", "write 0.1,1,10"
+        ) from None
 
 
 @command("train-maxent")
@@ -646,7 +649,12 @@ def _method(learner: dict[str, Any]) -> list[Any]:
     from irlcli.settings import PENALISED
 
     method, weight = learner.get("method"), learner.get("penalty_weight")
-    return [method, f"lambda {weight}" if method in PENALISED else None]
+    select = learner.get("select", "last")
+    return [
+        method,
+        f"lambda {weight}" if method in PENALISED else None,
+        f"selecting by {select}" if select != "last" else None,
+    ]
 
 
 def _origin(record: Any, makers: dict[str, Any]) -> str:
@@ -854,6 +862,7 @@ def report(
     if kind != "returns" and refs:
         raise UsageError(f"{kind} takes no references", "its runs are found by their settings")
     if kind == "returns":
+        _refuse(kind, {"--name": name})
         if not refs:
             raise UsageError(
                 "no evaluation is named: refs are missing", "irl report returns REF..."
@@ -864,6 +873,12 @@ def report(
     elif kind == "experts":
         _report_experts(session, env, name)
     elif kind == "table2":
+        _refuse(
+            kind,
+            {"--name": name, "--json, which has the values, with --format": form}
+            if session.as_json
+            else {"--name": name},
+        )
         _print_table2(session, form or "text")
     else:
         _report_experiment(session, kind, methods, seeds, env, choose_penalty, name)
@@ -892,7 +907,7 @@ def _report_experiment(
 
     chosen = experiments.METHODS if methods is None else tuple(methods.split(","))
     try:
-        numbers = tuple(int(seed) for seed in (seeds or "0,1,2,3,4").split(","))
+        numbers = tuple(int(seed) for seed in ("0,1,2,3,4" if seeds is None else seeds).split(","))
     except ValueError:
         raise UsageError(f"--seeds {seeds!r} is no list of seeds", "write 0,1,2,3,4") from None
     if min(numbers) < 0:
@@ -996,10 +1011,12 @@ def _report_figure2(session: Session, name: str | None) -> None:
 
 
 def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) -> None:
-    from irlcli.references import evaluation
+    from irlcli.references import circumstances, evaluation
     from irlcli.report.returns import rows
 
-    found = rows(evaluation(session.store, ref)[1] for ref in refs)
+    index = session.store.index()
+    named = [evaluation(session.store, ref) for ref in refs]
+    found = rows((summary, circumstances(artefact, index)) for artefact, summary in named)
     if session.as_json:
         items = [
             {

@@ -12,6 +12,7 @@ import msgspec
 
 from irlcli.errors import NotFound, UsageError
 from irlcli.interventions import parse_settings
+from irlcli.references import flat
 from irlcli.runner import Runner, Step, source_of
 from irlcli.settings import PENALISED, Settings
 from irlcli.stages import (
@@ -362,14 +363,17 @@ def _facts(artefacts: Iterable[Artefact]) -> tuple[dict[str, results.Run], dict[
         runs[artefact.id] = results.Run(
             stage=record.stage,
             about=_subject_text(record.stage, record.parameters),
-            commit=git.get("commit"),
-            dirty=git.get("dirty"),
+            code=tuple(dict.fromkeys(_code(state) for state in said.get("attempts") or [git])),
             libraries=name,
             seconds=said.get("seconds"),
             resumed=said.get("resumed"),
             inputs=tuple(sorted(set(_ids(said.get("inputs") or {})))),
         )
     return runs, libraries
+
+
+def _code(said: Mapping[str, Any]) -> results.Code:
+    return results.Code(commit=said.get("commit"), dirty=said.get("dirty"))
 
 
 def _ids(inputs: Mapping[str, str]) -> Iterator[str]:
@@ -447,17 +451,9 @@ def _difference(
 ) -> str:
     if version != wanted_version:
         return f"version {version} of the stage instead of {wanted_version}"
-    found, sought = dict(_flat(parameters)), dict(_flat(wanted))
+    found, sought = dict(flat(parameters)), dict(flat(wanted))
     names = sorted(n for n in found | sought if found.get(n) != sought.get(n))
     parts = [f"{n} {found.get(n, 'unset')} instead of {sought.get(n, 'unset')}" for n in names]
     if not parts:
         return "other inputs"
     return ", ".join(parts[:4]) + (f" and {len(parts) - 4} more" if len(parts) > 4 else "")
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", list(value) if isinstance(value, tuple | list) else value

@@ -6,14 +6,15 @@ output says so and no tensor library is loaded; a foreign file is opened and ask
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from irlcli import descriptions
 from irlcli.errors import NotFound, UsageError
 from irlcli.runner import source_of
 from irlcli.stages import Source
-from irlcli.store import Artefact, Resolved, Store, read_json
+from irlcli.store import Artefact, Index, Resolved, Store, read_json
 
 
 def tensor_file(
@@ -93,6 +94,39 @@ def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluatio
         raise UsageError(f"{ref!r} is no evaluation", "name artefacts that `irl evaluate` made")
     path = store.open(artefact, _only(artefact, "summary.json"))
     return artefact, descriptions.parse(read_json(path), descriptions.Evaluation, path)
+
+
+def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
+    """Every parameter behind an evaluation that its seeds have in common: ``STAGE.FIELD`` to value.
+
+    Without the seeds themselves, and without a lambda that was chosen for each of them. Of what
+    came from outside the store only the content is known.
+    """
+    found: dict[str, Any] = {}
+    pending = [artefact]
+    while pending:
+        record = pending.pop().manifest.record
+        for name, value in flat(record.parameters):
+            chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
+            if name not in ("seed", "settings", "setting") and not chosen:
+                found[f"{record.stage}.{name}"] = value
+        for role in ("policy", "reward", "demonstrations"):
+            sha = record.inputs.get(role)
+            makers = [] if sha is None else index.holders(sha)
+            if role == "demonstrations" and sha is not None:
+                found[f"{record.stage}.{role}"] = sha
+            elif makers:
+                pending.append(makers[0])
+    return found
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of nested parameters, by dotted name."""
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", list(value) if isinstance(value, tuple | list) else value
 
 
 def output(

@@ -19,6 +19,7 @@ from irlcli import provenance
 from irlcli.errors import IntegrityError, Interrupted, StageFailed, UsageError
 from irlcli.stages import Console, From, Job, Request, Source, Stage
 from irlcli.store import (
+    digest,
     Artefact,
     KeyRecord,
     Resolved,
@@ -95,18 +96,20 @@ class Runner:
 
     def plan(self, request: Request) -> list[Step]:
         """What :meth:`run` would do, inputs first; nothing is computed or written."""
-        steps: dict[tuple[str, str], Step] = {}
+        steps: dict[str, Step] = {}
         self._plan(request, steps)
         return list(steps.values())
 
-    def _plan(self, request: Request, steps: dict[tuple[str, str], Step]) -> Step:
+    def _plan(self, request: Request, steps: dict[str, Step]) -> tuple[str, Step]:
+        """What ``request`` is known by among ``steps``, and its step."""
         inputs: dict[str, str] = {}
+        known: dict[str, str] = {}
         missing = []
         for role, source in request.inputs.items():
             if isinstance(source, Source):
-                inputs[role] = source.sha256
+                inputs[role] = known[role] = source.sha256
                 continue
-            step = self._plan(source.request, steps)
+            known[role], step = self._plan(source.request, steps)
             if step.artefact is None:
                 missing.append(step.label)
             else:
@@ -115,8 +118,11 @@ class Runner:
             step = Step("BLOCKED", request.label, f"waits for {', '.join(missing)}")
         else:
             step = self._plan_ready(request, self._record(request, inputs))
-        steps.setdefault((request.stage.name, request.label), step)
-        return step
+        # By what it is, not by its label, which leaves things out that tell requests apart.
+        parameters = msgspec.to_builtins(request.parameters)
+        name = digest([request.stage.name, request.stage.version, parameters, known])
+        steps.setdefault(name, step)
+        return name, step
 
     def _plan_ready(self, request: Request, record: KeyRecord) -> Step:
         artefact = self.store.find(record.key)

@@ -208,6 +208,16 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     figure2: Figure2Settings = Figure2Settings()
 
 
+def check_profile(profile: str) -> None:
+    """Refuse what is no profile.
+
+    Raises:
+        UsageError: not one of :data:`PROFILES`.
+    """
+    if profile not in PROFILES:
+        raise UsageError(f"unknown profile {profile!r}", suggest(profile, PROFILES))
+
+
 def load_settings(
     env: str,
     profile: str = "standard",
@@ -229,8 +239,7 @@ def load_settings(
         OSError: ``file`` cannot be read.
     """
     environment(env)
-    if profile not in PROFILES:
-        raise UsageError(f"unknown profile {profile!r}", suggest(profile, PROFILES))
+    check_profile(profile)
     own = _settings_directory() / f"{env}.toml"
     tree = _read_toml(own)
     profiles = tree.pop("profiles", {})

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import pandas as pd
@@ -12,6 +13,7 @@ from test_architecture import loaded_by
 from irlcli.experiments import EXPERIMENTS
 from irlcli.settings import load_settings
 from irlcli.store import Store
+from irlcli.store.manifest import encode_provenance
 
 ROOT = Path(__file__).parent.parent
 SMALL = ["--set", "airl.total_steps=2048", "--set", "transfer.total_steps=1024"]
@@ -326,3 +328,72 @@ def test_no_experts(irl, tmp_path):
     assert tabular.code == 2 and "gridworld" in tabular.err
     refused = irl("report", "experts", "--seeds", "0", "--store", tmp_path / "runs")
     assert refused.code == 2 and "--seeds" in refused.err
+
+
+def test_baselines_alone_make_a_report(irl, tmp_path):
+    """As after `make experts`: nobody has learned a reward yet."""
+    common = ["--store", tmp_path / "runs", "--profile", "smoke", *SMALL]
+    assert irl("evaluate", "--idle", *ROW, "--ood", "bounce", *common).code == 0
+    done = irl("report", "table1", *ROW, *common)
+    assert done.code == 0, done.err
+    points = pd.read_csv(Path(done.out.strip()) / "seeds.csv")
+    assert list(points["agent"]) == ["idle"] and points["seed"].isna().all()
+
+
+def test_returns_of_runs_that_differ_are_not_one_row(irl, table_store):
+    common = ["--store", table_store, "--profile", "smoke", *SMALL]
+    pooled = irl("report", "returns", "erm.0.zero", "erm.1.zero", "--store", table_store)
+    assert pooled.code == 0, pooled.err
+    longer = [*common, "--set", "airl.total_steps=4096", "--seed", "2"]
+    assert (
+        irl("train-airl", "--demos", "demos", "--method", "erm", *longer, "--name", "x").code == 0
+    )
+    where = ["--policy", "x", "--ood", "engine-power"]
+    assert irl("evaluate", *where, *common, "--name", "x.zero").code == 0
+    refused = irl("report", "returns", "erm.0.zero", "x.zero", "--store", table_store)
+    assert refused.code == 2 and "train-airl.airl.total_steps: 2048 and 4096" in refused.err
+
+
+def test_a_run_that_went_on_elsewhere_is_mixed(report, table_store, tmp_path):
+    """Its attempts ran on two commits; the last one alone does not say so."""
+    store = tmp_path / "runs"
+    shutil.copytree(table_store, store, symlinks=True)
+    artefact = Store(store).resolve("erm.0").artefact
+    path = artefact.directory / "provenance.json"
+    said = artefact.provenance()
+    (attempt,) = said["attempts"]
+    said["attempts"] = [{**attempt, "commit": "0" * 40}, attempt]
+    artefact.directory.chmod(0o755)
+    path.chmod(0o644)
+    path.write_bytes(encode_provenance(artefact.manifest.id, said))
+    assert not any(n.startswith("Mixed") for n in notes(report("table1", table_store, *ROW)))
+    (mixed,) = (n for n in notes(report("table1", store, *ROW)) if n.startswith("Mixed"))
+    assert re.search(r"0000000000[^,;]* then ", mixed)
+
+
+def test_what_a_report_does_not_take_is_refused(irl, table_store):
+    for line in (
+        ["returns", "erm.0.zero", "--name", "x"],
+        ["table2", "--name", "x"],
+        ["table2", "--format", "latex", "--json"],
+        ["returns", "erm.0.zero", "--profile", "nope"],
+        ["table1", "--seeds", ""],
+    ):
+        refused = irl("report", *line, "--store", table_store)
+        assert refused.code == 2, line
+        assert "error:" in refused.err
+
+
+def test_make_does_not_take_other_runs_for_the_plain_ones():
+    def targets(*words):
+        line = ["make", "-n", "-C", str(ROOT), "-o", ".venv/.installed", "report-table1", *words]
+        return subprocess.run(line, capture_output=True, text=True)
+
+    assert "docs/results/table1" in targets().stdout
+    smoke = targets("PROFILE=smoke").stdout
+    assert "results/smoke/table1" in smoke and "docs/" not in smoke
+    for word in ("SET=--set airl.penalty_weight=3", "CHOOSE=--choose-penalty 1,10"):
+        refused = targets(word)
+        assert refused.returncode != 0 and "TAG=mine" in refused.stderr
+        named = targets(word, "TAG=three").stdout
+        assert "results/three/table1" in named and "--name three.table1" in named

@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from irlcli.report.results import duration
+from irlcli.report.results import commits, duration
 from irlcli.report.tables import markdown_table
 
 _TITLE = "Experts: true return in their own settings"
@@ -63,7 +63,7 @@ def table(
             "steps": steps[env],
             "seconds": learned[0].seconds if learned else None,
             "resumed": learned[0].resumed if learned else None,
-            "commit": learned[0].commit if learned else None,
+            "commit": ", ".join(commits(learned)) if learned else None,
             "stands": "done" if cell.run else cell.why,
         }
         rows.append(row)
@@ -87,7 +87,7 @@ def text_table(found: pd.DataFrame) -> dict[str, Any]:
                 *(_text(v) for v in (row.progress, row.idle_return, row.random_return)),
                 f"{row.steps:,}",
                 took,
-                row.commit[:10] if isinstance(row.commit, str) else "-",
+                row.commit if isinstance(row.commit, str) else "-",
             ]
         )
     return {"title": _TITLE, "note": _NOTE, "columns": columns, "rows": rows}

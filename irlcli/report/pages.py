@@ -6,7 +6,9 @@ import json
 from collections.abc import Mapping
 from html import escape
 
-from irlcli.report.results import TITLES, Plan, Report, Table, duration
+import pandas as pd
+
+from irlcli.report.results import TITLES, Plan, Report, Table, commits, duration
 from irlcli.report.tables import latex_table, markdown_table
 
 
@@ -38,10 +40,11 @@ def markdown(plan: Plan, report: Report) -> str:
 
 
 def _made(plan: Plan) -> str:
-    commits = sorted({run.commit or "unknown" for run in plan.runs.values()})
-    dirty = " with uncommitted changes" if any(run.dirty for run in plan.runs.values()) else ""
+    states = {state for run in plan.runs.values() for state in run.code}
+    named = sorted({state.commit or "unknown" for state in states})
+    dirty = " with uncommitted changes" if any(state.dirty for state in states) else ""
     total = duration(sum(run.seconds or 0.0 for run in plan.runs.values()))
-    return f"on {len(plan.runs)} runs, {total} in all, made at commit {', '.join(commits)}{dirty}."
+    return f"on {len(plan.runs)} runs, {total} in all, made at commit {', '.join(named)}{dirty}."
 
 
 # HTML
@@ -149,10 +152,10 @@ def _seeds(report: Report) -> Table:
             p.row,
             TITLES[p.agent],
             p.measure,
-            "-" if p.seed != p.seed else f"{p.seed:.0f}",
+            "-" if pd.isna(p.seed) else f"{p.seed:.0f}",
             p.setting,
             f"{p.true_return:.1f}",
-            "-" if p.progress is None or p.progress != p.progress else f"{p.progress:.1f}",
+            "-" if pd.isna(p.progress) else f"{p.progress:.1f}",
             str(p.episodes),
             p.evaluation,
         ]
@@ -181,7 +184,7 @@ def _tree(plan: Plan, id16: str, indent: str) -> list[str]:
         return [f"{indent}{id16}  not among the runs planned for"]
     run = plan.runs[id16]
     took = "" if run.seconds is None else f"  {duration(run.seconds)}"
-    line = f"{indent}{id16}  {run.stage}  {run.about}{took}  at {(run.commit or 'unknown')[:10]}"
+    line = f"{indent}{id16}  {run.stage}  {run.about}{took}  at {', '.join(commits([run]))}"
     return [line, *(x for i in run.inputs for x in _tree(plan, i, indent + "  "))]
 
 

@@ -155,7 +155,7 @@ def _cells(plan: Plan, points: pd.DataFrame) -> pd.DataFrame:
                     "iqm": s.iqm,
                     "progress": None if math.isnan(progress) else float(progress),
                     "complete": all(c.run for c in planned),
-                    "mixed": len(_origins(plan, (c.run for c in planned if c.run))) > 1,
+                    "mixed": _is_mixed(_origins(plan, (c.run for c in planned if c.run))),
                 }
             )
     table = pd.DataFrame(found)
@@ -290,11 +290,10 @@ def _mixed(plan: Plan) -> list[str]:
     notes = []
     for row in plan.rows:
         origins = _origins(plan, (c.run for c in plan.cells if c.row == row.name and c.run))
-        if len(origins) > 1:
+        if _is_mixed(origins):
             parts = [
-                f"commit {(commit or 'unknown')[:10]}{' with changes ' + dirty if dirty else ''}, "
-                f"libraries {libraries}: {_runs(len(ids))}"
-                for (commit, dirty, libraries), ids in origins.items()
+                f"commit {_states(code)}, libraries {libraries}: {_runs(len(ids))}"
+                for (code, libraries), ids in origins.items()
             ]
             notes.append(
                 f"Mixed: {row.name}: its runs differ in the code or the libraries they were made "
@@ -316,12 +315,16 @@ def lineage(plan: Plan, ids: Iterable[str]) -> list[str]:
 
 
 def _origins(plan: Plan, ids: Iterable[str]) -> dict[tuple, list[str]]:
-    """Runs behind ``ids`` by (commit, digest of changes, libraries), the largest group first."""
+    """Runs behind ``ids`` by (states of the code, libraries), the largest group first."""
     groups: dict[tuple, list[str]] = {}
     for id16 in lineage(plan, ids):
         run = plan.runs[id16]
-        groups.setdefault((run.commit, run.dirty, run.libraries), []).append(id16)
+        groups.setdefault((run.code, run.libraries), []).append(id16)
     return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+
+
+def _is_mixed(origins: Mapping[tuple, Any]) -> bool:
+    return len(origins) > 1 or any(len(code) > 1 for code, _ in origins)
 
 
 # Tables for people
@@ -500,20 +503,28 @@ def _costs(plan: Plan) -> Table:
                     duration(float(np.median(seconds))) if seconds else "-",
                     duration(sum(seconds)) if seconds else "-",
                     str(sum(1 for r in runs if r.resumed)),
-                    ", ".join(_commits(runs)),
+                    ", ".join(commits(runs)),
                 ]
             )
     note = (
-        "Time of one process on a machine that other runs shared; a resumed run counts what it took "
-        "after it was resumed. + marks uncommitted changes."
+        "Time of one process on a machine that other runs shared; a resumed run counts each attempt "
+        "up to its last checkpoint. + marks uncommitted changes."
     )
     columns = ["row", "stage", "runs", "median time", "in all", "resumed", "commits"]
     return Table("What ran", note, columns, lines, heads=2)
 
 
-def _commits(runs: Sequence[Any]) -> list[str]:
-    texts = {f"{(r.commit or 'unknown')[:10]}{'+' if r.dirty else ''}" for r in runs}
-    return sorted(texts)
+def commits(runs: Sequence[Any]) -> list[str]:
+    """The commits that ``runs`` ran on, shortened; ``+`` marks uncommitted changes."""
+    states = {state for run in runs for state in run.code}
+    return sorted(f"{(s.commit or 'unknown')[:10]}{'+' if s.dirty else ''}" for s in states)
+
+
+def _states(code: Sequence[Any]) -> str:
+    return " then ".join(
+        f"{(s.commit or 'unknown')[:10]}{' with changes ' + s.dirty if s.dirty else ''}"
+        for s in code
+    )
 
 
 def duration(seconds: float) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from irlcli.descriptions import Evaluation, Subject
 from irlcli.errors import UsageError
@@ -35,18 +36,20 @@ class Row:
         return statistics.stdev(self.returns) if len(self.returns) > 1 else None
 
 
-def rows(summaries: Iterable[Evaluation]) -> list[Row]:
-    """Rows of evaluation summaries (``summary.json``), one per agent, method and setting.
+def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Row]:
+    """Rows of evaluations, one per agent, method and setting: experts first, random and idle last.
 
-    Experts first, random and idle last.
+    Args:
+        evaluations: ``summary.json``, and the parameters behind it that no seed may change.
 
     Raises:
-        UsageError: one seed of the reward learning twice in a row: the same evaluation again, or
-            runs that differ in something no row shows.
+        UsageError: one seed of the reward learning twice in a row, or seeds that differ in one of
+            those parameters.
     """
+    made: dict[tuple[int, str, str, str], Mapping[str, Any]] = {}
     seen: set[tuple] = set()
     groups: dict[tuple[int, str, str, str], list[tuple[float, int, float | None]]] = {}
-    for summary in summaries:
+    for summary, parameters in evaluations:
         policy = summary.policy
         order = _ORDER.index(policy.agent)
         for item in summary.settings:
@@ -59,6 +62,14 @@ def rows(summaries: Iterable[Evaluation]) -> list[Row]:
                     "a row's sample is the seed: report runs that differ in anything else apart",
                 )
             seen.add((*key, seed))
+            first = made.setdefault(key, parameters)
+            for name in sorted(first | parameters):
+                if first.get(name) != parameters.get(name):
+                    raise UsageError(
+                        f"runs of {agent_name(policy)} in {item.setting} differ in {name}: "
+                        f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
+                        "a row's sample is the seed: report runs that differ in anything else apart",
+                    )
             groups.setdefault(key, []).append(values)
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):

@@ -68,7 +68,7 @@ def request(
 
 
 def _role(weight: float, setting: str) -> str:
-    return f"lambda {weight:g} without {setting}"
+    return f"lambda {weight!r} without {setting}"
 
 
 def run(job: Job) -> None:

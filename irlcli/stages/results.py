@@ -60,16 +60,23 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.env} {self.knob}"
 
 
+class Code(msgspec.Struct, frozen=True, kw_only=True):
+    """What a process ran on: a commit, and a digest of what was not committed; None if unknown."""
+
+    commit: str | None
+    dirty: str | None
+
+
 class Run(msgspec.Struct, frozen=True, kw_only=True):
     """What is known of one artefact; None where its provenance does not say.
 
-    ``libraries`` names an entry of :attr:`Parameters.libraries`, ``inputs`` are artefacts' ids.
+    ``code`` has each state that one of its attempts ran on; ``libraries`` names an entry of
+    :attr:`Parameters.libraries`, ``inputs`` are artefacts' ids.
     """
 
     stage: str
     about: str
-    commit: str | None
-    dirty: str | None
+    code: tuple[Code, ...]
     libraries: str
     seconds: float | None
     resumed: int | None
@@ -162,4 +169,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 1, run)
+STAGE = Stage("report", 2, run)

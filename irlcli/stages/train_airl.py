@@ -27,7 +27,7 @@ def request(
     settings_: Sequence[Setting],
     airl: AIRLSettings,
     seed: int = 0,
-    basis: Mapping[str, Source] | None = None,
+    basis: Mapping[str, Source | From] | None = None,
 ) -> Request:
     """A reward and a student policy learned from ``demos``, recorded in ``settings_`` of ``env``.
 

@@ -29,10 +29,11 @@ class Index:
 
     def parents(self, artefact: Artefact) -> dict[str, list[Artefact]]:
         """For each input role of ``artefact``, the artefacts that hold that content."""
-        return {
-            role: [self.artefacts[id16] for id16 in self._sources.get(sha, [])]
-            for role, sha in artefact.manifest.record.inputs.items()
-        }
+        return {role: self.holders(sha) for role, sha in artefact.manifest.record.inputs.items()}
+
+    def holders(self, sha: str) -> list[Artefact]:
+        """The artefacts that hold the content ``sha``."""
+        return [self.artefacts[id16] for id16 in self._sources.get(sha, [])]
 
     def reached_from(self, ids: Iterable[str]) -> set[str]:
         """The artefacts ``ids``, their ancestors, and those of artefacts of a newer schema."""

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from irlcli.report import pages, results
 from irlcli.report.tables import latex_table, latex_text, markdown_table
 from irlcli.settings import Settings
-from irlcli.stages.results import Cell, Others, Parameters, Row, Run
+from irlcli.stages.results import Cell, Code, Others, Parameters, Row, Run
 
 SETTINGS = {
     "expert": {"total_steps": 1000},
@@ -40,8 +40,7 @@ def evaluation(number, commit="c0ffee", dirty=None, inputs=()):
     return Run(
         stage="evaluate",
         about=f"run {number}",
-        commit=commit,
-        dirty=dirty,
+        code=(Code(commit=commit, dirty=dirty),),
         libraries="lib",
         seconds=90.0,
         resumed=0,
@@ -193,7 +192,12 @@ def test_runs_that_cannot_be_told_apart_are_named():
 
 def test_other_commits_behind_a_cell_are_marked_also_far_behind_it():
     plan, points = made(full())
-    old = Run(**{**{f: getattr(evaluation(0), f) for f in Run.__struct_fields__}, "commit": "0ld"})
+    old = Run(
+        **{
+            **{f: getattr(evaluation(0), f) for f in Run.__struct_fields__},
+            "code": (Code(commit="0ld", dirty=None),),
+        }
+    )
     (target,) = (
         c
         for c in plan.cells

@@ -7,11 +7,12 @@ from irlcli.errors import UsageError
 from irlcli.report.returns import rows
 
 
-def evaluation(agent, mean, seed=None, **subject):
-    return Evaluation(
+def evaluation(agent, mean, seed=None, made=None, **subject):
+    summary = Evaluation(
         policy=Subject(agent=agent, env="lunar-lander", seed=seed, **subject),
         settings=(Returns(setting="bounce=0.9", episodes=20, mean_return=mean),),
     )
+    return summary, made or {}
 
 
 def test_statistics_are_over_seeds():
@@ -35,3 +36,11 @@ def test_a_seed_that_comes_twice_is_refused():
     twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
     with pytest.raises(UsageError, match="airl-erm zero-shot in bounce=0.9 has seed 3 twice"):
         rows(twice)
+
+
+def test_seeds_that_differ_in_more_than_the_seed_are_refused():
+    made = [{"train-airl.airl.penalty_weight": weight, "evaluate.env": "x"} for weight in (1, 100)]
+    students = [evaluation("student", 1.0, k, m, method="irm") for k, m in enumerate(made)]
+    with pytest.raises(UsageError, match=r"differ in train-airl\.airl\.penalty_weight: 1 and 100"):
+        rows(students)
+    assert len(rows(students[:1])) == 1

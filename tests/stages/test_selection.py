@@ -136,7 +136,7 @@ def test_lambda_is_the_one_that_does_best_in_the_settings_left_out(chosen):
     sources = {
         role: found[0].manifest.record for role, found in chosen.index().parents(choice).items()
     }
-    for weight in ("0.1", "1"):
+    for weight in ("0.1", "1.0"):
         for setting, other in ((FIRST, SECOND), (SECOND, FIRST)):
             airl = sources[f"lambda {weight} without {setting}"].parameters["airl"]
             assert (airl["penalty_weight"], airl["select"]) == (float(weight), setting)
