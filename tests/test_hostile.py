@@ -27,7 +27,7 @@ from irlcli import cli, console, provenance
 from irlcli.checkpoints import RefusedCode, from_bytes, load_reward_file, restore, to_bytes
 from irlcli.dataset import EPISODES, STEPS
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.stages import train_maxent, transfer
+from irlcli.stages import Stage, train_maxent, transfer
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
@@ -353,6 +353,19 @@ def test_checkpoints_of_another_stage_are_not_used():
         from_bytes(to_bytes({"x": Path("/")}))
 
 
+def save_checkpoint(store: Store, key: str, stage: Stage, state: dict) -> None:
+    """Write ``state`` where ``stage`` at work on ``key`` would find it, as its own."""
+    header = provenance.Header(
+        schema=provenance.SCHEMA,
+        stage=stage.name,
+        stage_version=stage.version,
+        libraries=provenance.libraries(),
+        attempts=(),
+    )
+    with store.working_on(key, wait=False) as scratch:
+        scratch.save(header.encode(to_bytes(state)))
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -371,15 +384,7 @@ def test_a_checkpoint_made_by_somebody_is_named(irl, store_copy, changes):
     (store.root / ".keys" / key).unlink()
     rows = torch.frombuffer(bytearray(b"[]"), dtype=torch.uint8)
     state = {"trainer": {}, "adversary": {}, "selection": {}, "round": 0, "rows": rows, **changes}
-    header = provenance.Header(
-        schema=provenance.SCHEMA,
-        stage="transfer",
-        stage_version=transfer.STAGE.version,
-        libraries=provenance.libraries(),
-        attempts=(),
-    )
-    with store.working_on(key, wait=False) as scratch:
-        scratch.save(header.encode(to_bytes(state)))
+    save_checkpoint(store, key, transfer.STAGE, state)
     done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
     assert_refused((done.code, done.out, done.err), 4, key)
     shutil.rmtree(store.root / ".work" / key)
@@ -404,15 +409,7 @@ def test_a_gridworld_checkpoint_made_by_somebody_is_named(irl, maze_store, tmp_p
     found = store.get(store.names()["maxent"]).manifest.record
     (store.root / ".keys" / found.key).unlink()
     state = {"iterations": 1, "networks": {}, "optimizer": {}, "records": [], **changes}
-    header = provenance.Header(
-        schema=provenance.SCHEMA,
-        stage="train-maxent",
-        stage_version=train_maxent.STAGE.version,
-        libraries=provenance.libraries(),
-        attempts=(),
-    )
-    with store.working_on(found.key, wait=False) as scratch:
-        scratch.save(header.encode(to_bytes(state)))
+    save_checkpoint(store, found.key, train_maxent.STAGE, state)
     done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", path)
     assert_refused((done.code, done.out, done.err), 4, found.key)
 
