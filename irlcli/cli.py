@@ -453,7 +453,11 @@ def evaluate(
         agent = "expert" if expert else "random" if random else "idle"
         artefacts = _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name)
     if artefacts and not session.as_json:
-        _print_returns(session, [a.id for a in artefacts], stderr=True)
+        from irlcli.references import evaluation
+
+        # Of one policy, or of one expert for each setting: nothing is pooled.
+        made = [(evaluation(session.store, a.id)[1], {}) for a in artefacts]
+        _print_returns(session, made, stderr=True)
 
 
 def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name):
@@ -867,7 +871,7 @@ def report(
             raise UsageError(
                 "no evaluation is named: refs are missing", "irl report returns REF..."
             )
-        _print_returns(session, refs)
+        _report_returns(session, refs)
     elif kind == "figure2":
         _report_figure2(session, name)
     elif kind == "experts":
@@ -1010,13 +1014,18 @@ def _report_figure2(session: Session, name: str | None) -> None:
         print(session.store.open(artefacts[0], "figure2.md").read_text(), file=sys.stderr, end="")
 
 
-def _print_returns(session: Session, refs: Sequence[str], stderr: bool = False) -> None:
+def _report_returns(session: Session, refs: Sequence[str]) -> None:
     from irlcli.references import circumstances, evaluation
+
+    named = [evaluation(session.store, ref) for ref in refs]
+    index = session.store.index()
+    _print_returns(session, [(summary, circumstances(a, index)) for a, summary in named])
+
+
+def _print_returns(session: Session, evaluations: Sequence[Any], stderr: bool = False) -> None:
     from irlcli.report.returns import rows
 
-    index = session.store.index()
-    named = [evaluation(session.store, ref) for ref in refs]
-    found = rows((summary, circumstances(artefact, index)) for artefact, summary in named)
+    found = rows(evaluations)
     if session.as_json:
         items = [
             {

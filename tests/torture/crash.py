@@ -1,11 +1,12 @@
 """Kill, refuse, fill the disk, set the clock back: the store stays whole, and a rerun ends in the
 same bytes.
 
-    python tests/torture/crash.py [--short]
+    python tests/torture/crash.py [--short] [--part random ...]
 """
 
 from __future__ import annotations
 
+import argparse
 import errno
 import os
 import shutil
@@ -169,44 +170,52 @@ def in_mount_namespace(script: Path, arguments: list[str]) -> subprocess.Complet
     return subprocess.run(line, capture_output=True, text=True)
 
 
+PARTS = ("random", "refused", "clock", "disk", "calls")
+
+
+def attack(part: str, chain: Chain, work: Path, short: bool) -> None:
+    """Do one of :data:`PARTS` and print its figures."""
+    stage = "train-maxent"
+    if part == "calls":
+        for each, stride in ((stage, 14),) if short else (("grid", 1), (stage, 6)):
+            found = killed_at_every_call(chain, each, work, stride)
+            figures("crash", {f"{each}: kills, at every call by {stride}": found})
+    elif part == "random":
+        for each in (stage,) if short else chain.before:
+            found, runs = killed_at_random(chain, each, work, 2 if short else 20)
+            figures("crash", {f"{each}: kills at random times": found, f"{each}: runs": runs})
+    elif part == "refused":
+        how = (25, (False,)) if short else (6, (False, True))
+        figures("crash", {"refused calls": refused_calls(chain, stage, work, *how)})
+    elif part == "clock":
+        figures("crash", {"clocks set": clock_set_back(chain, stage, work)})
+    elif not short:
+        disks = in_mount_namespace(Path(__file__), ["--full-disk"])
+        if disks is None:
+            print("crash: full disk: left out, a tmpfs may not be mounted here")
+        else:
+            assert disks.returncode == 0, disks.stderr
+            print(disks.stdout, end="")
+
+
 def main() -> None:
-    short = "--short" in sys.argv
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--short", action="store_true")
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--full-disk", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
     preload()
     warm_up()
     with tempfile.TemporaryDirectory(prefix="irl-torture-") as name:
         work = Path(name)
-        if "--full-disk" in sys.argv:
-            figures("full disk", full_disk(Chain(work, CHEAP), "train-maxent", work, 2))
+        if options.full_disk:
+            figures("full disk", full_disk(Chain(work, CHEAP), "train-maxent", work, 4))
             return
         begin = time.monotonic()
-        chain = Chain(work, CHEAP) if short else Chain(work)
-        kills = 0
-        for stage in ("grid", "train-maxent") if not short else ("train-maxent",):
-            found = killed_at_every_call(chain, stage, work, 14 if short else 1)
-            kills += found
-            figures("crash", {f"{stage}: kills, one at every call": found})
-        for stage in chain.before if not short else ("train-maxent",):
-            found, runs = killed_at_random(chain, stage, work, 2 if short else 20)
-            kills += found
-            figures("crash", {f"{stage}: kills at random times": found, "completed runs": runs})
-        how = (25, (False,)) if short else (3, (False, True))
-        refused = refused_calls(chain, "train-maxent", work, *how)
-        clocks = clock_set_back(chain, "train-maxent", work)
-        disks = in_mount_namespace(Path(__file__), ["--full-disk"]) if not short else None
-        if disks is not None:
-            assert disks.returncode == 0, disks.stderr
-            print(disks.stdout, end="")
-        elif not short:
-            print("crash: full disk: left out, a tmpfs may not be mounted here")
-        figures(
-            "crash",
-            {
-                "kills": kills,
-                "refused calls": refused,
-                "clocks set": clocks,
-                "seconds": round(time.monotonic() - begin),
-            },
-        )
+        chain = Chain(work, CHEAP) if options.short else Chain(work)
+        for part in options.part:
+            attack(part, chain, work, options.short)
+        figures("crash", {"seconds": round(time.monotonic() - begin)})
 
 
 if __name__ == "__main__":

@@ -30,7 +30,8 @@ needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="faults.c needs
 @needs_cc
 def test_killed_refused_and_with_another_clock():
     found = short("crash")
-    assert found["kills"] >= 6 and found["refused calls"] >= 6 and found["clocks set"] == 2
+    kills = sum(number for name, number in found.items() if "kills" in name)
+    assert kills >= 6 and found["refused calls"] >= 6 and found["clocks set"] == 2
 
 
 @needs_cc
