@@ -8,6 +8,8 @@ demonstrations are equal bytes.
 from __future__ import annotations
 
 import json
+import os
+import resource
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -207,6 +209,7 @@ def _opened(path: Path) -> pq.ParquetFile:
         raise ValueError("it is not a plain file")
     if information.st_size > _MAX_FILE_BYTES:
         raise ValueError(f"it is larger than {_MAX_FILE_BYTES >> 30} GiB")
+    _check_footer(path)
     # As a dictionary a long text counts once, however many rows say it.
     texts = ["setting"] if path.name == EPISODES else []
     file = pq.ParquetFile(path, read_dictionary=texts, page_checksum_verification=True)
@@ -215,6 +218,29 @@ def _opened(path: Path) -> pq.ParquetFile:
         file.close()
         raise ValueError(f"{information.st_size:,} bytes that declare {declared:,}")
     return file
+
+
+def _check_footer(path: Path) -> None:
+    """Describe every column in a child process: of some footers that aborts pyarrow's process.
+
+    ``RowGroupMetaData.column`` lets an exception of C++ through where the statistics of sizes do
+    not fit the schema (pyarrow 26).
+
+    Raises:
+        ValueError: the child did not survive.
+    """
+    child = os.fork()
+    if child == 0:
+        try:
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+            for _ in _chunks(pq.read_metadata(path)):
+                pass
+        finally:
+            # What it raises, reading it here raises too.
+            os._exit(0)
+    if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
+        raise ValueError("its footer is malformed")
 
 
 def _declared_bytes(metadata: pq.FileMetaData, bytes_per_value: int) -> int:
@@ -269,8 +295,11 @@ def _parse(steps: pa.Table, episodes: pa.Table) -> dict[str, tuple[Trajectory, .
     if not rows:
         raise ValueError("there is no episode in it")
     lengths = [row["length"] for row in rows]
-    if min(lengths) < 1 or not np.array_equal(
-        steps["episode"].to_numpy(), np.repeat(np.arange(len(rows)), lengths)
+    # First their sum: what is made of them is as large.
+    if (
+        min(lengths) < 1
+        or sum(lengths) != len(steps)
+        or not np.array_equal(steps["episode"].to_numpy(), np.repeat(np.arange(len(rows)), lengths))
     ):
         raise ValueError("steps and episodes do not fit each other")
     observations = _matrix(steps["obs"])

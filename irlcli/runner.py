@@ -19,13 +19,13 @@ from irlcli import provenance
 from irlcli.errors import IntegrityError, Interrupted, StageFailed, UsageError
 from irlcli.stages import Console, From, Job, Request, Source, Stage
 from irlcli.store import (
-    digest,
     Artefact,
     KeyRecord,
     Resolved,
     Scratch,
     Store,
     content_digest,
+    digest,
     directory_outputs,
     file_digest,
 )

@@ -273,7 +273,23 @@ def huge(directory: Path) -> None:
     os.truncate(directory / STEPS, 1 << 40)
 
 
+def aborting_footer(directory: Path) -> None:
+    """A histogram of repetition levels with a bin too many: pyarrow 26 aborts where it sees it."""
+    data = (directory / EPISODES).read_bytes()
+    at = data.rindex(b"<)&")
+    (directory / EPISODES).write_bytes(data[: at + 2] + b"6" + data[at + 3 :])
+
+
+def endless_episode(directory: Path) -> None:
+    table = pq.read_table(directory / EPISODES)
+    lengths = pa.array([1 << 30] * len(table), table.schema.field("length").type)
+    changed = table.set_column(table.schema.get_field_index("length"), "length", lengths)
+    pq.write_table(changed, directory / EPISODES)
+
+
 DATASETS = {
+    "aborting": aborting_footer,
+    "endless": endless_episode,
     "rows": declare_many_rows,
     "text": long_setting,
     "nested": nested,
