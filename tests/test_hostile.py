@@ -276,8 +276,21 @@ def huge(directory: Path) -> None:
 def aborting_footer(directory: Path) -> None:
     """A histogram of repetition levels with a bin too many: pyarrow 26 aborts where it sees it."""
     data = (directory / EPISODES).read_bytes()
-    at = data.rindex(b"<)&")
-    (directory / EPISODES).write_bytes(data[: at + 2] + b"6" + data[at + 3 :])
+    start = end = data.rindex(b"<)&") + 3
+    for _ in range(2):  # the bins, numbers of variable length
+        while data[end] & 0x80:
+            end += 1
+        end += 1
+    size = int.from_bytes(data[-8:-4], "little") + 1
+    (directory / EPISODES).write_bytes(
+        data[: start - 1]
+        + b"6"
+        + data[start:end]
+        + b"\0"
+        + data[end:-8]
+        + size.to_bytes(4, "little")
+        + data[-4:]
+    )
 
 
 def endless_episode(directory: Path) -> None:
