@@ -12,6 +12,7 @@ import resource
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -57,7 +58,7 @@ def main() -> None:
     worlds.reset = _timed(worlds.reset, seconds, "environment")
     trainer.model.collect_rollouts = _timed(trainer.model.collect_rollouts, seconds, "rollout")
     trainer.model.train = _timed(trainer.model.train, seconds, "PPO update")
-    reward = _timed(adversary.reward, seconds, "rewards")
+    reward = _timed(partial(adversary.reward, policy=trainer.policy), seconds, "rewards")
 
     steps = 0
     for index in range(-1, arguments.rounds):

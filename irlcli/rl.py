@@ -402,6 +402,12 @@ class Policy:
         with torch.no_grad():
             return self.network.get_distribution(observations).log_prob(actions)
 
+    def gaussian(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and deviation [B, A] of pi(.|s) for observations [B, D], without gradient."""
+        with torch.no_grad():
+            distribution = self.network.get_distribution(observations).distribution
+            return distribution.mean, distribution.stddev
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The network's tensors."""
         return self.network.state_dict()

@@ -197,6 +197,30 @@ def penalty_weight_at(round_index: int, weight: float, warmup: int, ramp: int) -
     return weight * min(1.0, (round_index - warmup + 1) / max(1, ramp))
 
 
+def clipped_log_prob(
+    mean: torch.Tensor,
+    std: torch.Tensor,
+    actions: torch.Tensor,
+    low: torch.Tensor,
+    high: torch.Tensor,
+) -> torch.Tensor:
+    """log pi [B] of a diagonal Gaussian's samples after clipping to [low, high].
+
+    Inside the bounds it is the Gaussian's density, at a bound the mass beyond it. Without that,
+    how far an action lies beyond a bound tells the expert from the policy, though it does nothing.
+
+    Args:
+        mean, std: of the samples, [B, A].
+        actions: clipped, [B, A].
+        low, high: the bounds, [A].
+    """
+    inside = torch.distributions.Normal(mean, std).log_prob(actions)
+    below = torch.special.log_ndtr((low - mean) / std)
+    above = torch.special.log_ndtr((mean - high) / std)
+    at_bounds = torch.where(actions <= low, below, above)
+    return torch.where((low < actions) & (actions < high), inside, at_bounds).sum(-1)
+
+
 def policy_reward(
     model: RewardModel,
     data: Transitions,

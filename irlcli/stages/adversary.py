@@ -22,8 +22,9 @@ from irlcli.irl.networks import RewardModel
 from irlcli.rl import Policy, Rollout, world_groups
 from irlcli.seeds import derive
 from irlcli.settings import PENALISED, AIRLSettings
+from irlcli.stages.actions import SeenActions
 from irlcli.stages.outputs import write_json
-from irlcli.trajectories import Transitions, join, transitions
+from irlcli.trajectories import Trajectory, Transitions, join, transitions
 
 
 class Adversary:
@@ -41,6 +42,7 @@ class Adversary:
 
     Raises:
         IntegrityError: the demonstrations' observations are not the environment's.
+        UsageError: ``airl.actions`` that the environment does not have.
     """
 
     def __init__(
@@ -49,10 +51,11 @@ class Adversary:
         self.config = config
         self._horizon = environment(demos.env).max_episode_steps
         self._seed = seed
+        self.actions = SeenActions(config, worlds.action_space)
         groups = list(demos.trajectories.values())
         self._world_settings = world_groups(len(worlds), len(groups))
         self._world_groups = self._world_settings
-        self._expert_settings = [transitions(group, self._horizon) for group in groups]
+        self._expert_settings = [self._transitions(group) for group in groups]
         self._expert = self._expert_settings
         if config.method == "irm-shuffled":
             rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
@@ -60,7 +63,7 @@ class Adversary:
             episodes = [trajectory for group in groups for trajectory in group]
             dealt = deal(of_episodes, rng)
             self._expert = [
-                transitions([episodes[i] for i in np.flatnonzero(dealt == e)], self._horizon)
+                self._transitions([episodes[i] for i in np.flatnonzero(dealt == e)])
                 for e in range(len(groups))
             ]
             self._world_groups = deal(self._world_settings, rng)
@@ -93,13 +96,19 @@ class Adversary:
         for data in self._expert:
             self.model.normaliser.update(torch.as_tensor(data.observations))
 
-    def reward(self, rollout: Rollout) -> np.ndarray:
-        """The policy's rewards [T, N] for one rollout, by the present discriminator."""
-        data = rollout_transitions(rollout, slice(None), self._horizon)
+    def _transitions(self, episodes: Sequence[Trajectory]) -> Transitions:
+        return self.actions.of(transitions(episodes, self._horizon))
+
+    def reward(self, rollout: Rollout, policy: Policy) -> np.ndarray:
+        """The rewards [T, N] of ``policy`` for its rollout, by the present discriminator."""
+        data = self.actions.of(rollout_transitions(rollout, slice(None), self._horizon))
+        log_probs = torch.as_tensor(rollout.log_probs.ravel())
+        if self.actions.clipped:
+            log_probs = self.actions.log_prob(policy, data)
         reward = airl.policy_reward(
             self.model,
             data,
-            torch.as_tensor(rollout.log_probs.ravel()),
+            log_probs,
             self.config.policy_reward,
             self.config.fixed_horizon,
             self.config.ppo.gamma,
@@ -176,12 +185,10 @@ class Adversary:
                     for r, kept in zip(rollouts, whole, strict=True)
                 ]
             )
-        return [join(part) for part in parts]
+        return [self.actions.of(join(part)) for part in parts]
 
     def _pool(self, data: Transitions, policy: Policy) -> airl.Pool:
-        log_probs = policy.log_prob(
-            torch.as_tensor(data.observations), torch.as_tensor(data.actions)
-        )
+        log_probs = self.actions.log_prob(policy, data)
         return airl.make_pool(self.model, data, log_probs, self.config.fixed_horizon)
 
     def _grouped(

@@ -36,7 +36,7 @@ def train_rounds(
     """
     first, rows = 0, []
     if adversary is not None:
-        reward = adversary.reward
+        reward = partial(adversary.reward, policy=trainer.policy)
     names = {"trainer", "adversary", "selection", "round", "rows"}
     state = checkpoints.restore(job.checkpoints.load(), names, job.console.warn)
     if state is not None:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 
 from irlcli import rl
 from irlcli.dataset import Demonstrations
@@ -19,8 +18,9 @@ from irlcli.errors import UsageError
 from irlcli.interventions import parse_setting
 from irlcli.rl import Policy
 from irlcli.settings import AIRLSettings
+from irlcli.stages.actions import SeenActions
 from irlcli.stages.adversary import Adversary
-from irlcli.trajectories import Trajectory
+from irlcli.trajectories import Trajectory, transitions
 
 HELD_OUT_SHARE = 5  # one episode in so many, at least one
 
@@ -29,11 +29,11 @@ class Selection:
     """Keeps the policy and the reward of the round with the highest score so far.
 
     Args:
-        score: of a policy; higher is better.
+        score: of a policy, and the actions that likelihoods are of; higher is better.
         every: rounds between two scores; the last of ``rounds`` is always scored.
     """
 
-    def __init__(self, score: Callable[[Policy], float], every: int, rounds: int):
+    def __init__(self, score: Callable[[Policy, SeenActions], float], every: int, rounds: int):
         self._score = score
         self._every = every
         self._rounds = rounds
@@ -43,7 +43,7 @@ class Selection:
         """The score of round ``index``, NaN where none is due; the earlier of equals is kept."""
         if (index + 1) % self._every and index + 1 != self._rounds:
             return float("nan")
-        score = self._score(policy)
+        score = self._score(policy, adversary.actions)
         if not self.best or score > self.best["score"]:
             self.best = {
                 "round": index,
@@ -100,18 +100,20 @@ def split(
     return kept, Selection(score, config.select_every, rounds)
 
 
-def log_likelihood(policy: Policy, held_out: Mapping[str, Sequence[Trajectory]]) -> float:
+def log_likelihood(
+    policy: Policy, actions: SeenActions, held_out: Mapping[str, Sequence[Trajectory]]
+) -> float:
     """Mean log pi(a|s) over the steps of ``held_out``, every setting of equal weight."""
     means = []
     for trajectories in held_out.values():
-        observations = np.concatenate([t.observations[:-1] for t in trajectories])
-        actions = np.concatenate([t.actions for t in trajectories])
-        log_probs = policy.log_prob(torch.as_tensor(observations), torch.as_tensor(actions))
-        means.append(float(log_probs.double().mean()))
+        data = actions.of(transitions(trajectories, max(len(t) for t in trajectories)))
+        means.append(float(actions.log_prob(policy, data).double().mean()))
     return float(np.mean(means))
 
 
-def true_return(policy: Policy, env: str, setting: str, episodes: int, seed: int) -> float:
+def true_return(
+    policy: Policy, _: SeenActions, env: str, setting: str, episodes: int, seed: int
+) -> float:
     """Mean true return of ``policy`` in ``setting``, from the same states in every round."""
     where = parse_setting(env, setting)
     trajectories = rl.roll_out(env, where, policy, episodes, seed, "selection")

@@ -57,6 +57,7 @@ def run(job: Job) -> None:
     from irlcli import rl
     from irlcli.checkpoints import load_reward_file
     from irlcli.irl import airl
+    from irlcli.stages.actions import SeenActions
     from irlcli.stages.adversary import rollout_transitions
     from irlcli.stages.outputs import write_metrics, write_policy
     from irlcli.stages.policy_training import train_rounds
@@ -68,7 +69,7 @@ def run(job: Job) -> None:
     absorbing = origin.airl.fixed_horizon
 
     def reward(rollout):
-        data = rollout_transitions(rollout, slice(None), horizon)
+        data = actions.of(rollout_transitions(rollout, slice(None), horizon))
         log_probs = torch.as_tensor(rollout.log_probs.ravel())
         g = airl.policy_reward(model, data, log_probs, "g", absorbing, ppo.gamma)
         return (g / origin.scale).numpy().reshape(rollout.terminated.shape)
@@ -83,6 +84,7 @@ def run(job: Job) -> None:
                 "a goal (goal-y, direction) is part of the observation: transfer to a setting "
                 "with the same kind of intervention as in training",
             )
+        actions = SeenActions(origin.airl, worlds.action_space)
         trainer = rl.PPOTrainer(worlds, ppo, p.transfer.total_steps, p.seed, STAGE.name)
         rows = train_rounds(job, trainer, [p.setting], reward)
     write_policy(

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 
 from irlcli.envs.lunar_lander import LunarLander
@@ -250,3 +251,52 @@ def test_join_is_concatenation():
     joined = join([a, b])
     np.testing.assert_array_equal(joined.actions, [*a.actions, *b.actions])
     np.testing.assert_array_equal(joined.take(np.array([3])).observations, b.observations[:1])
+
+
+def test_clipped_log_prob_is_a_distribution_over_the_interval_and_its_ends():
+    """scipy's tails at the bounds; the density inside and the two masses add up to one."""
+    low, high = torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 2.0])
+    mean, std = torch.tensor([[0.3, 1.7]]), torch.tensor([[0.8, 0.4]])
+    for k in range(2):
+        normal = scipy.stats.norm(float(mean[0, k]), float(std[0, k]))
+        ends = torch.stack([low[k], high[k]])[:, None]
+        arguments = mean[:, k : k + 1], std[:, k : k + 1]
+        bounds = low[k : k + 1], high[k : k + 1]
+        tails = airl.clipped_log_prob(*arguments, ends, *bounds)
+        np.testing.assert_allclose(
+            tails, [normal.logcdf(float(low[k])), normal.logsf(float(high[k]))], rtol=1e-5
+        )
+        grid = torch.linspace(float(low[k]), float(high[k]), 100_001)[1:-1, None]
+        inside = airl.clipped_log_prob(*arguments, grid, *bounds).double().exp()
+        step = float(high[k] - low[k]) / 100_000
+        assert float(inside.sum() * step + tails.double().exp().sum()) == pytest.approx(1, abs=1e-4)
+    both = airl.clipped_log_prob(mean, std, torch.tensor([[0.1, 2.0]]), low, high)
+    first = airl.clipped_log_prob(mean[:, :1], std[:, :1], torch.tensor([[0.1]]), low[:1], high[:1])
+    last = airl.clipped_log_prob(mean[:, 1:], std[:, 1:], torch.tensor([[2.0]]), low[1:], high[1:])
+    torch.testing.assert_close(both, first + last)
+
+
+def test_clipped_log_prob_stays_finite_far_from_the_bounds():
+    far = airl.clipped_log_prob(
+        torch.tensor([[-8.0]]),
+        torch.tensor([[0.05]]),
+        torch.tensor([[1.0]]),
+        torch.tensor([-1.0]),
+        torch.tensor([1.0]),
+    )
+    assert float(far) == pytest.approx(scipy.stats.norm(-8, 0.05).logsf(1.0), rel=1e-5)
+
+
+def test_the_entropy_of_clipped_actions_is_bounded():
+    """Without bounds on log pi's actions, -log pi pays for noise without end."""
+    torch.manual_seed(0)
+    bounds = torch.tensor([-1.0]), torch.tensor([1.0])
+    entropies = []
+    for std in (1.0, 10.0, 1000.0):
+        scale = torch.full((200_000, 1), std)
+        actions = (torch.randn(200_000, 1) * std).clamp(-1, 1)
+        log_probs = airl.clipped_log_prob(torch.zeros_like(scale), scale, actions, *bounds)
+        entropies.append(-float(log_probs.mean()))
+    assert entropies[2] == pytest.approx(np.log(2), abs=0.01)
+    # The interval and its two ends weigh four: no distribution over them has more.
+    assert max(entropies) < math.log(4)

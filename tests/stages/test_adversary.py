@@ -1,5 +1,7 @@
 """Which transitions the discriminator sees: whole episodes, in the groups of the method."""
 
+from functools import partial
+
 import msgspec
 import numpy as np
 import pytest
@@ -86,7 +88,7 @@ def test_deal_gives_every_group_its_share_of_every_setting():
 
 def test_rounds_cut_no_episode_that_the_discriminator_sees(demos):
     trainer, adversary = make(demos, ppo=PPOSettings(n_envs=8, n_steps=1500))
-    (rollout,) = trainer.train_round(0, adversary.reward)
+    (rollout,) = trainer.train_round(0, partial(adversary.reward, policy=trainer.policy))
     groups = adversary._by_group([rollout], adversary._world_groups)
     for data in groups:
         # Each kept episode stands for exactly the horizon: its steps and its absorbing ones.
@@ -122,7 +124,7 @@ def test_diagnostics_stay_with_the_true_settings_when_labels_are_shuffled(demos)
         assert adversary._expert_settings[0].observations.shape[0] == sum(
             len(t) for t in demos.trajectories[str(SETTINGS[0])]
         )
-        rollouts = trainer.train_round(0, adversary.reward)
+        rollouts = trainer.train_round(0, partial(adversary.reward, policy=trainer.policy))
         found.append(adversary.train_round(0, rollouts, trainer.policy))
     assert [set(row) for row in found[0]] == [set(row) for row in found[1]]
     assert found[0] != found[1]

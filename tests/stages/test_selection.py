@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -40,10 +41,10 @@ def test_the_first_of_the_best_rounds_is_kept_and_put_back(networks):
     trainer, adversary = networks
     scores = {1: 2.0, 3: 5.0, 5: 5.0, 6: 4.0}
     given = iter(scores.values())
-    chosen = selection.Selection(lambda policy: next(given), every=2, rounds=7)
+    chosen = selection.Selection(lambda policy, actions: next(given), every=2, rounds=7)
     states = []
     for index in range(7):
-        rollouts = trainer.train_round(index, adversary.reward)
+        rollouts = trainer.train_round(index, partial(adversary.reward, policy=trainer.policy))
         adversary.train_round(index, rollouts, trainer.policy)
         states.append(
             (
@@ -66,7 +67,7 @@ def test_the_first_of_the_best_rounds_is_kept_and_put_back(networks):
 
 def test_log_likelihood_weighs_settings_not_steps(networks, demos):
     """Against SB3's own evaluation of actions, and with one setting's data repeated."""
-    policy = networks[0].policy
+    policy, actions = networks[0].policy, networks[1].actions
     means = []
     for trajectories in demos.trajectories.values():
         log_probs = [
@@ -77,9 +78,11 @@ def test_log_likelihood_weighs_settings_not_steps(networks, demos):
         ]
         means.append(float(torch.cat(log_probs).mean()))
     expected = np.mean(means)
-    assert selection.log_likelihood(policy, demos.trajectories) == pytest.approx(expected, rel=1e-5)
+    assert selection.log_likelihood(policy, actions, demos.trajectories) == pytest.approx(
+        expected, rel=1e-5
+    )
     repeated = {FIRST: demos.trajectories[FIRST] * 5, SECOND: demos.trajectories[SECOND]}
-    assert selection.log_likelihood(policy, repeated) == pytest.approx(expected, rel=1e-5)
+    assert selection.log_likelihood(policy, actions, repeated) == pytest.approx(expected, rel=1e-5)
 
 
 def test_held_out_episodes_are_not_trained_on(demos, networks):
@@ -88,7 +91,7 @@ def test_held_out_episodes_are_not_trained_on(demos, networks):
     assert [len(group) for group in kept.trajectories.values()] == [5, 5]
     held_out = {text: group[-1:] for text, group in demos.trajectories.items()}
     score = chosen.consider(0, networks[0].policy, networks[1])
-    assert score == selection.log_likelihood(networks[0].policy, held_out)
+    assert score == selection.log_likelihood(networks[0].policy, networks[1].actions, held_out)
 
 
 def test_a_selecting_setting_is_not_trained_on(demos, networks):
@@ -97,7 +100,9 @@ def test_a_selecting_setting_is_not_trained_on(demos, networks):
     assert list(kept.trajectories) == [SECOND]
     first, again = (chosen.consider(0, networks[0].policy, networks[1]) for _ in range(2))
     assert first == again
-    assert first == selection.true_return(networks[0].policy, "lunar-lander", FIRST, 2, 3)
+    assert first == selection.true_return(
+        networks[0].policy, networks[1].actions, "lunar-lander", FIRST, 2, 3
+    )
 
 
 def test_a_single_demonstration_cannot_be_held_out(demos):
