@@ -302,7 +302,7 @@ def endless_episode(directory: Path) -> None:
 
 DATASETS = {
     "aborting": aborting_footer,
-    "endless": endless_episode,
+    "endless-episode": endless_episode,
     "rows": declare_many_rows,
     "text": long_setting,
     "nested": nested,
