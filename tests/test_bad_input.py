@@ -140,6 +140,8 @@ WRONG = [
     ("train-airl --demos demos --set airl.learning_rate=inf", 2, "airl.learning_rate"),
     ("train-airl --demos demos --set airl.ppo.n_envs=3", 2, "3 worlds"),
     ("train-airl --demos demos --set airl.ppo.n_envs=0", 2, "airl.ppo.n_envs"),
+    ("train-airl --demos demos --set airl.actions=executed", 2, "needs continuous actions"),
+    ("train-airl --demos demos --set airl.actions=clipped", 2, "airl.actions"),
     ("train-airl --demos demos --settings absent.toml", 2, "absent.toml"),
     ("train-airl --demos demos --settings {tmp}", 2, "{tmp}"),
     ("train-airl --demos demos --settings {tmp}/broken.toml", 2, "broken.toml"),

@@ -49,6 +49,8 @@ def request(
         )
     texts = tuple(str(s) for s in settings_)
     airl = _resolved_selection(airl, texts)
+    if airl.actions == "sampled":
+        airl = msgspec.structs.replace(airl, actions=msgspec.UNSET)
     trained = len(_trained(airl, texts))
     if airl.ppo.n_envs % trained:
         raise UsageError(

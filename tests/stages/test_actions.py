@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from irlcli.dataset import Demonstrations
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
 from irlcli.settings import AIRLSettings, PPOSettings
-from irlcli.stages import selection
+from irlcli.stages import Source, selection, train_airl
 from irlcli.stages.actions import SeenActions
 from irlcli.stages.adversary import Adversary
 
@@ -85,6 +87,15 @@ def test_likelihoods_of_held_out_episodes_are_of_the_same_actions(demos):
     trainer, adversary = learned(demos, "executed", "f")
     score = partial(selection.log_likelihood, trainer.policy, adversary.actions)
     assert score(demos.trajectories) == score(further_out(demos).trajectories)
+
+
+def test_sampled_is_what_unset_means():
+    source = Source(Path("demos"), "0" * 64)
+    unset, sampled, executed = (
+        train_airl.request(source, "reacher", SETTINGS, AIRLSettings(ppo=PPO, actions=actions))
+        for actions in (msgspec.UNSET, "sampled", "executed")
+    )
+    assert unset.parameters == sampled.parameters != executed.parameters
 
 
 def test_discrete_actions_have_no_bounds():
