@@ -2,6 +2,7 @@
 
 import gc as garbage_collector
 import inspect
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
@@ -1108,10 +1109,18 @@ def _top(
 
 def main() -> None:
     """Entry point: exit codes and one-line errors (design: Command line)."""
+    try:
+        _main()
+    except KeyboardInterrupt:
+        # A second Ctrl-C, on the way out from the first.
+        _fail(Interrupted("interrupted", "run the same command again to go on"), _as_json())
+
+
+def _main() -> None:
     # Most of a light command is importing, which makes no garbage; the runner switches the
     # collector on again when there is work to do.
     garbage_collector.disable()
-    as_json = "--json" in sys.argv
+    as_json = _as_json()
     out.prepare_streams()
     try:
         # Without arguments, what there is to ask for; typer would call that an error.
@@ -1158,6 +1167,8 @@ def _usage(error: Any) -> UsageError:
 
 
 def _fail(error: IrlError, as_json: bool) -> None:
+    # From here on there is nothing left to interrupt.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if _debugging():
         import traceback
 
@@ -1167,6 +1178,10 @@ def _fail(error: IrlError, as_json: bool) -> None:
     finally:
         # Also where nobody reads the message: the code says the same.
         sys.exit(error.exit_code)
+
+
+def _as_json() -> bool:
+    return "--json" in sys.argv
 
 
 def _debugging() -> bool:

@@ -130,7 +130,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_exit_130(tmp_path):
     assert "BLOCKED collect-experts" in plan
 
 
-def interrupted(arguments, count):
+def interrupted(arguments, count, gap=0.05):
     """Exit code and stderr of a command that gets ``count`` SIGINTs once it is at work."""
     process = subprocess.Popen(
         irl(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -141,16 +141,17 @@ def interrupted(arguments, count):
     time.sleep(3.0)  # past the imports, into the episodes
     for _ in range(count):
         process.send_signal(signal.SIGINT)
-        time.sleep(0.05)
+        time.sleep(gap)
     _, errors = process.communicate(timeout=400)
     return process.returncode, errors
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count):
+@pytest.mark.parametrize(("count", "gap"), [(1, 0.05), (2, 0.05), (2000, 0.002)])
+def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count, gap):
+    """Also a key that is held down: the signals that hit the way out change nothing."""
     arguments = ["evaluate", "--random", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
     arguments += ["--episodes", "1500", "--store", str(tmp_path / "runs")]
-    code, errors = interrupted(arguments, count)
+    code, errors = interrupted(arguments, count, gap)
     assert code == 130
     assert "error:" in errors and "hint:" in errors and "Traceback" not in errors
 
