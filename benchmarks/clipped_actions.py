@@ -1,0 +1,55 @@
+"""What lies beyond the bounds of the actions, and what log pi(a|s) makes of it.
+
+    python -m benchmarks.clipped_actions DEMONSTRATIONS POLICY
+
+Of each setting: the share of the demonstrations' action components beyond the bounds, how large
+they are, and the mean log pi of the demonstrations and of the policy's own actions in the same
+states, by ``airl.actions`` sampled and executed. Both arguments are artefacts' directories.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from irlcli import envs
+from irlcli.checkpoints import load_policy_file
+from irlcli.dataset import read_demonstrations
+from irlcli.interventions import environment, parse_setting
+from irlcli.settings import AIRLSettings
+from irlcli.stages.actions import SeenActions
+from irlcli.trajectories import transitions
+
+
+def main(demonstrations: Path, policy_directory: Path) -> None:
+    """Print a line for each setting and each of the two."""
+    demos = read_demonstrations(demonstrations)
+    policy, _ = load_policy_file(policy_directory / "policy.pt")
+    torch.manual_seed(0)
+    print(
+        "setting                   beyond  99 % below  actions   log pi: demonstrations  the policy"
+    )
+    for setting, episodes in demos.trajectories.items():
+        data = transitions(episodes, environment(demos.env).max_episode_steps)
+        space = envs.make(demos.env, parse_setting(demos.env, setting)).action_space
+        size = np.abs(data.actions) / space.high
+        own = replace(data, actions=policy.act(data.observations))
+        for kind in ("sampled", "executed"):
+            seen = SeenActions(AIRLSettings(actions=kind), space)
+            theirs, its = (
+                float(seen.log_prob(policy, seen.of(d)).double().mean()) for d in (data, own)
+            )
+            print(
+                f"{setting:<24}  {(size > 1).mean():>5.0%}  {np.quantile(size, 0.99):>10.1f}  "
+                f"{kind:<8}  {theirs:>22.1f}  {its:>10.1f}"
+            )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("usage: python -m benchmarks.clipped_actions DEMONSTRATIONS POLICY")
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
