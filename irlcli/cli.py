@@ -500,7 +500,7 @@ def _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name
             env,
             [setting],
             config.evaluation,
-            From(train_expert.request(env, setting, 0, config.expert), "policy.pt"),
+            From(train_expert.request(env, setting, 0, config.expert_of(setting)), "policy.pt"),
             seed=seed,
         )
         for setting in settings

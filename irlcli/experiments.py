@@ -193,7 +193,7 @@ def experts(
                     for agent in ("random", "idle")
                 ]
                 for place in places:
-                    learned = train_expert.request(env, place, 0, config.expert)
+                    learned = train_expert.request(env, place, 0, config.expert_of(place))
                     made = plan(learned)[-1].artefact
                     if made is not None:
                         role = f"{env} {place} learning"
@@ -285,7 +285,7 @@ def _row(
         return evaluate.request(env, places, config.evaluation, source, agent)
 
     def expert(place: Any) -> Request:
-        return train_expert.request(env, place, 0, config.expert)
+        return train_expert.request(env, place, 0, config.expert_of(place))
 
     planned = [
         _Planned(

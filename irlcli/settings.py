@@ -15,7 +15,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from irlcli.errors import UsageError, suggest
-from irlcli.interventions import environment, parse_settings
+from irlcli.interventions import Setting, environment, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
 
@@ -79,12 +79,15 @@ class PPOSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class InterventionSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Paper Table 2: the values trained on and the held-out ones.
 
-    ``episodes`` are the demonstrations of each value trained on, where they differ.
+    ``episodes`` are the demonstrations of each value trained on, where they differ. In a file,
+    ``expert_ppo`` holds what this knob's experts need different from ``expert.ppo``; once loaded,
+    all of their PPO.
     """
 
     id: tuple[str, ...]
     ood: tuple[str, ...]
     episodes: tuple[Count, ...] = ()
+    expert_ppo: PPOSettings | UnsetType = UNSET
 
 
 class ExpertSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -210,6 +213,13 @@ class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     maxent: MaxEntSettings = MaxEntSettings()
     figure2: Figure2Settings = Figure2Settings()
 
+    def expert_of(self, setting: Setting) -> ExpertSettings:
+        """The settings of the expert of ``setting``, those of its knob included."""
+        listed = self.interventions.get(setting.knob or "")
+        if listed is None or listed.expert_ppo is UNSET:
+            return self.expert
+        return msgspec.structs.replace(self.expert, ppo=listed.expert_ppo)
+
 
 def check_profile(profile: str) -> None:
     """Refuse what is no profile.
@@ -261,20 +271,27 @@ def load_settings(
 def _stack(env: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Settings:
     """The settings that ``layers`` of (source, values) lead to, later ones winning."""
     tree: dict[str, Any] = {}
-    for _, values in layers:
+    for source, values in layers:
         tree = _merge(tree, values)
-    try:
-        return _convert(env, tree)
-    except UsageError:
-        # The layer with which it first fails is the one to name.
-        tree = {}
-        for source, values in layers:
-            tree = _merge(tree, values)
-            try:
-                _convert(env, tree)
-            except UsageError as error:
-                raise UsageError(f"{source}: {error.message}", error.hint) from None
-        raise
+        try:
+            settings = _convert(env, tree)
+        except UsageError as error:
+            raise UsageError(f"{source}: {error.message}", error.hint) from None
+    interventions = {
+        knob: msgspec.structs.replace(listed, expert_ppo=_expert_ppo(knob, layers))
+        for knob, listed in settings.interventions.items()
+        if listed.expert_ppo is not UNSET
+    }
+    return msgspec.structs.replace(settings, interventions=settings.interventions | interventions)
+
+
+def _expert_ppo(knob: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> PPOSettings:
+    """In every layer, what is said of the knob wins over ``expert.ppo``, but no later layer."""
+    tree: dict[str, Any] = {}
+    for _, values in layers:
+        tree = _merge(tree, values.get("expert", {}).get("ppo", {}))
+        tree = _merge(tree, values.get("interventions", {}).get(knob, {}).get("expert_ppo", {}))
+    return msgspec.convert(tree, PPOSettings)
 
 
 def _settings_directory() -> Path:

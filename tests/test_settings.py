@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from msgspec import UNSET
 
 from irlcli.errors import UsageError
 from irlcli.interventions import ENVIRONMENTS, parse_settings
@@ -106,6 +107,25 @@ def test_a_layer_changes_only_what_it_names(toml):
     restored = msgspec.structs.replace(after.airl.ppo, n_envs=before.airl.ppo.n_envs)
     airl = msgspec.structs.replace(after.airl, ppo=restored)
     assert msgspec.structs.replace(after, airl=airl) == before
+
+
+def test_a_knob_has_experts_of_its_own(toml):
+    """Within a layer what is said of the knob wins over ``expert.ppo``; a later layer wins over both."""
+    mine = toml(
+        "[expert.ppo]\nn_epochs = 3\ngamma = 0.5\n"
+        "[interventions.bounce.expert_ppo]\nn_epochs = 7\nuse_sde = true"
+    )
+    config = load_settings(LANDER, "smoke", mine, ["expert.ppo.gamma=0.25"])
+    bounce, power = (
+        config.expert_of(parse_settings(LANDER, text)[0])
+        for text in ("bounce=0.1", "engine-power=1x")
+    )
+    assert power == config.expert and power.ppo.use_sde is UNSET
+    assert (power.ppo.n_epochs, power.ppo.gamma) == (3, 0.25)
+    changed = msgspec.structs.replace(config.expert.ppo, n_epochs=7, use_sde=True)
+    assert bounce == msgspec.structs.replace(config.expert, ppo=changed)
+    later = load_settings(LANDER, "smoke", mine, ["expert.ppo.n_epochs=9"])
+    assert later.expert_of(parse_settings(LANDER, "bounce=0.1")[0]).ppo.n_epochs == 9
 
 
 def test_an_empty_file_changes_nothing(toml):
@@ -267,6 +287,9 @@ def test_files_that_cannot_be_read(tmp_path):
         ("[interventions.bounce]\nid = ['soft']\nood = ['0.9']", "bounce", "bounce=0.5"),
         ("[interventions.bounce]\nid = [0.1]\nood = ['0.9']", "interventions", ""),
         ("[interventions.bounce]\nvalues = ['0.1']", "interventions", ""),
+        ("[interventions.bounce.expert_ppo]\nn_epoch = 3", "n_epoch", ""),
+        ("[interventions.bounce.expert_ppo]\nn_epochs = 0", "expert_ppo.n_epochs", ""),
+        ("[interventions.bounce]\nexpert_ppo = 3", "expert_ppo", ""),
         ("[interventions.leg-length]\nid = ['1x']\nood = ['2x']", "leg-length", "bounce"),
     ],
 )
@@ -285,6 +308,11 @@ def test_the_layer_at_fault_is_named_not_an_innocent_one(toml):
     error = refused(file=path, flags={"airl.method": "gail"})
     assert "--method" in error.message and "gail" in error.message
     assert str(path) not in error.message
+
+
+def test_a_later_layer_does_not_hide_what_is_wrong(toml):
+    path = toml("expert = 3")
+    assert str(path) in refused(file=path, overrides=["expert.total_steps=5000"]).message
 
 
 def test_flags_are_named_as_they_are_written():

@@ -75,7 +75,7 @@ def request(
     )
     # Experts do not depend on the seed of the sampling: every dataset shares them.
     experts = {
-        f"expert {s}": From(train_expert.request(env, s, 0, config.expert), "policy.pt")
+        f"expert {s}": From(train_expert.request(env, s, 0, config.expert_of(s)), "policy.pt")
         for s in settings_
     }
     return Request(STAGE, parameters, experts, label)
