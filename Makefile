@@ -9,8 +9,8 @@
 #   CHOOSE="--choose-penalty 1,10" lambda of the penalised methods by leaving a setting out
 #   TAG=mine                       what the runs' names begin with: the profile, and with SET or
 #                                  CHOOSE yours to say, so that no run takes another's name
-#   RESULTS=DIR                    where a report's files go: docs/results/TARGET for the standard
-#                                  profile's own runs, else results/TAG/TARGET
+#   RESULTS=DIR                    where a report's files go, by default results/TAG/TARGET;
+#                                  what is published is RESULTS=docs/results/TARGET
 #   STORE=DIR                      artefact store
 #   RUN="srun -c2"                 put before every irl command, e.g. to spread over a cluster
 #
@@ -123,7 +123,7 @@ ENV     = $(patsubst $(KIND)-%,--env %,$(filter $(KIND)-%,$(WHAT)))
 COMMA  := ,
 SPACE  := $(subst ,, )
 LIST    = $(subst $(SPACE),$(COMMA),$(strip $(1)))
-RESULTS ?= $(if $(filter standard,$(TAG)),docs/results,results/$(TAG))/$(WHAT)
+RESULTS ?= results/$(TAG)/$(WHAT)
 
 define REPORT
 @set -e; made=$$($(RUN) $(IRL) report $(KIND) $(COMMON) $(CHOOSE) $(ENV) --seeds $(call LIST,$(SEEDS)) \

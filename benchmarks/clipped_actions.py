@@ -4,31 +4,35 @@
 
 Of each setting: the share of the demonstrations' action components beyond the bounds, how large
 they are, and the mean log pi of the demonstrations and of the policy's own actions in the same
-states, by ``airl.actions`` sampled and executed. Both arguments are artefacts' directories.
+states, by ``airl.actions`` sampled and executed. Both are artefacts, in the store that IRL_STORE
+names, ``runs`` by default.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from irlcli import envs
+from irlcli import envs, references
 from irlcli.checkpoints import load_policy_file
 from irlcli.dataset import read_demonstrations
+from irlcli.errors import IrlError
 from irlcli.interventions import environment, parse_setting
 from irlcli.settings import AIRLSettings
 from irlcli.stages.actions import SeenActions
+from irlcli.store import Store
 from irlcli.trajectories import transitions
 
 
-def main(demonstrations: Path, policy_directory: Path) -> None:
+def main(demonstrations: str, learned: str) -> None:
     """Print a line for each setting and each of the two."""
-    demos = read_demonstrations(demonstrations)
-    policy, _ = load_policy_file(policy_directory / "policy.pt")
+    store = Store(os.environ.get("IRL_STORE", "runs"))
+    demos = read_demonstrations(references.demonstrations(store, demonstrations)[0].path)
+    policy, _ = load_policy_file(references.tensor_file(store, learned, "policy")[0].path)
     torch.manual_seed(0)
     print(
         "setting                   beyond  99 % below  actions   log pi: demonstrations  the policy"
@@ -52,4 +56,7 @@ def main(demonstrations: Path, policy_directory: Path) -> None:
 if __name__ == "__main__":
     if len(sys.argv) != 3:
         sys.exit("usage: python -m benchmarks.clipped_actions DEMONSTRATIONS POLICY")
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    try:
+        main(*sys.argv[1:])
+    except IrlError as error:
+        sys.exit(f"error: {error.message}\nhint: {error.hint}")

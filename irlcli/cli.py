@@ -87,7 +87,7 @@ class Session:
             finally:
                 self.console.close()
             if name is not None:
-                self.store.set_name(name, artefacts[0])
+                self.name(name, artefacts[0])
         for artefact in artefacts:
             record = artefact.manifest.record
             if self.as_json:
@@ -105,6 +105,12 @@ class Session:
             else:
                 out.print_data(str(artefact.directory))
         return artefacts
+
+    def name(self, name: str, artefact: Any) -> None:
+        """Let ``name`` stand for ``artefact``, and say what loses it: gc may take that now."""
+        before = self.store.set_name(name, artefact)
+        if before is not None:
+            self.console.warn(f"{name} no longer names {before}")
 
     def _read(self, artefact: Any, output: str) -> Any:
         from irlcli.store import read_json
@@ -294,6 +300,7 @@ def train_airl(
     }
     airl = session.settings(env, flags).airl
     parsed = [parse_setting(env, text) for text in settings]
+    _check_penalised(airl.method, penalty_weight)
     # Before the choice of lambda, which takes long.
     train_airl.request(source, env, parsed, airl, seed)
     basis = {}
@@ -311,6 +318,16 @@ def train_airl(
         airl = msgspec.structs.replace(airl, penalty_weight=made.chosen)
         basis["penalty choice"] = source_of(Resolved(chosen, path))
     session.deliver([train_airl.request(source, env, parsed, airl, seed, basis)], name)
+
+
+def _check_penalised(method: str, penalty_weight: float | None) -> None:
+    from irlcli.settings import PENALISED
+
+    if penalty_weight is not None and method not in PENALISED:
+        raise UsageError(
+            f"--penalty-weight {penalty_weight:g}: {method} has no penalty",
+            f"give --method {' or '.join(PENALISED)}, or leave it away",
+        )
 
 
 def _numbers(flag: str, text: str) -> list[float]:
@@ -353,6 +370,7 @@ def train_maxent(
         "maxent.features": features,
     }
     config = session.settings(env, flags)
+    _check_penalised(config.maxent.method, penalty_weight)
     parsed = [parse_setting(env, text) for text in settings]
     request = train_maxent.request(source, env, parsed, _unseen(env, config), config.maxent, seed)
     artefacts = session.deliver([request], name)
@@ -471,7 +489,7 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
     config = session.settings(origin.env, {"evaluation.episodes": episodes})
     if ood is not None or intervention is not None:
         kind = "id" if ood is None else "ood"
-        settings = _settings(origin.env, config, ood or intervention, kind, origin)
+        settings = _settings(origin.env, config, intervention if ood is None else ood, kind, origin)
     else:
         settings = [parse_setting(origin.env, s) for s in origin.settings]
     request = evaluate.request(origin.env, settings, config.evaluation, source, seed=seed)
@@ -486,7 +504,10 @@ def _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name
             f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"
         )
     config = session.settings(env, {"evaluation.episodes": episodes})
-    settings = _settings(env, config, ood or intervention, "id" if ood is None else "ood")
+    if ood is None:
+        settings = _settings(env, config, intervention, "id")
+    else:
+        settings = _settings(env, config, ood, "ood")
     if agent != "expert":
         request = evaluate.request(env, settings, config.evaluation, agent=agent, seed=seed)
         return session.deliver([request], name)
@@ -540,6 +561,10 @@ def _settings(env: str, config: Any, text: str, kind: str, origin: Any = None) -
         return parse_settings(env, text)
     if text in config.interventions:
         values = getattr(config.interventions[text], kind)
+        if not values:
+            raise UsageError(
+                f"settings/ lists no {kind.upper()} values of {text!r}", f"write {text}=VALUE,VALUE"
+            )
         return parse_settings(env, f"{text}={','.join(values)}")
     if origin is None or text in environment(env).knobs or text[:1].isalpha():
         knob_of(env, text)
@@ -604,6 +629,7 @@ def ls(
     stage: Annotated[str | None, typer.Option(help="Only this stage.")] = None,
 ) -> None:
     """List the artefacts."""
+    _check_there(session)
     names: dict[str, list[str]] = {}
     for name, id16 in session.store.names().items():
         names.setdefault(id16, []).append(name)
@@ -623,6 +649,9 @@ def ls(
         if stage is None or a.manifest.record.stage == stage
     ]
     found.sort(key=lambda item: (item["stage"], item["about"], item["id"]))
+    if stage is not None and not found:
+        there = sorted({a.manifest.record.stage for a in index.artefacts.values()})
+        session.console.warn(f"no artefact is of stage {stage!r}; there are: {', '.join(there)}")
     if session.as_json:
         out.print_json("artefacts", {"artefacts": found, "newer": sorted(index.newer)})
         return
@@ -631,13 +660,22 @@ def ls(
         out.print_table(["id", "stage", "about", "names"], rows)
 
 
+def _check_there(session: Session) -> None:
+    """A mistyped store would look like a sound, empty one."""
+    if not session.store.root.exists():
+        raise NotFound(
+            f"there is no store at {session.store.root}",
+            "name another with --store or IRL_STORE; what makes an artefact makes the store",
+        )
+
+
 def _about(parameters: dict[str, Any]) -> str:
     """The parameters that tell one artefact of a stage from another.
 
     Any artefact has parameters, also one that somebody made up: nothing is taken for granted.
     """
     settings = parameters.get("settings")
-    parts = [parameters.get("env"), parameters.get("agent")]
+    parts = [parameters.get("kind"), parameters.get("env"), parameters.get("agent")]
     parts += settings if isinstance(settings, list) else [parameters.get("setting")]
     return _joined([*parts, *_learned(parameters)])
 
@@ -657,9 +695,13 @@ def _method(learner: dict[str, Any]) -> list[Any]:
     select = learner.get("select", "last")
     return [
         method,
-        f"lambda {weight}" if method in PENALISED else None,
+        f"lambda {_number(weight)}" if method in PENALISED else None,
         f"selecting by {select}" if select != "last" else None,
     ]
+
+
+def _number(value: Any) -> Any:
+    return f"{value:g}" if isinstance(value, (int, float)) else value
 
 
 def _origin(record: Any, makers: dict[str, Any]) -> str:
@@ -746,7 +788,9 @@ def verify(
     quick: Annotated[bool, typer.Option("--quick", help="Compare sizes, hash nothing.")] = False,
 ) -> None:
     """Check stored bytes against their digests; damaged artefacts go to quarantine."""
-    ids = [_artefact(session, ref).id] if ref else session.store.ids()
+    if ref is None:
+        _check_there(session)
+    ids = session.store.ids() if ref is None else [_artefact(session, ref).id]
     found = session.store.verify(ids, quick)
     newer = [id16 for id16, damage in found.items() if damage.newer]
     damaged = {id16: damage for id16, damage in found.items() if not damage.newer}
@@ -794,6 +838,7 @@ def gc(
     """Find (and with --delete remove) artefacts that no name leads to."""
     if not grace_days >= 0:
         raise UsageError(f"--grace-days {grace_days} is no number of days", "0 or more")
+    _check_there(session)
     grace = grace_days * 86400
     if delete:
         artefacts, work = session.store.collect(grace)
@@ -822,7 +867,7 @@ def name(
 ) -> None:
     """Name an artefact."""
     artefact = _artefact(session, ref)
-    session.store.set_name(name, artefact)
+    session.name(name, artefact)
     if session.as_json:
         out.print_json("name", {"name": name, "id": artefact.id})
     else:

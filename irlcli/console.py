@@ -40,7 +40,7 @@ class TerminalConsole:
         self._tensorboard = tensorboard
         self._writer = None
         if tensorboard is not None:
-            _require_tensorboard()
+            _require_tensorboard(tensorboard)
         self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
 
     def start(self, label: str, resumed: bool) -> None:
@@ -233,7 +233,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
 
 
-def _require_tensorboard() -> None:
+def _require_tensorboard(directory: Path) -> None:
     """Say before the work, not after its first round, that the mirror cannot be written."""
     import importlib.util
 
@@ -242,3 +242,5 @@ def _require_tensorboard() -> None:
             "--tensorboard needs the package tensorboard, which is not installed",
             f"{sys.executable} -m pip install tensorboard, or leave --tensorboard away",
         )
+    if directory.exists() and not directory.is_dir():
+        raise UsageError(f"--tensorboard {directory} is no directory", "name one, or a new one")

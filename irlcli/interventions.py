@@ -272,11 +272,20 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
     knob_of(env, knob)
     settings = tuple(Setting(knob, parse_value(env, knob, part)) for part in values.split(","))
     for i, setting in enumerate(settings):
-        if setting in settings[:i]:
-            raise UsageError(
-                f"{text!r} names {setting} twice", "each setting is one dataset group: name it once"
-            )
+        for other in settings[:i]:
+            if _world(setting) == _world(other):
+                again = f", once as {setting}" if setting != other else ""
+                raise UsageError(
+                    f"{text!r} names {other} twice{again}",
+                    "each setting is one dataset group: name it once",
+                )
     return settings
+
+
+def _world(setting: Setting) -> tuple[float, ...]:
+    """Equal for values of a knob that make one world, however written: 10 and 10..10."""
+    kind, numbers = setting.value or ("absolute", ())
+    return numbers[:1] if kind == "range" and numbers[0] == numbers[1] else numbers
 
 
 def parse_setting(env: str, text: str) -> Setting:

@@ -31,7 +31,7 @@ from irlcli import envs
 from irlcli.activations import ACTIVATIONS
 from irlcli.descriptions import PolicyNetwork
 from irlcli.envs.vector import Ended, VectorWorlds
-from irlcli.envs.workers import WorkerFailed, WorkerWorlds
+from irlcli.envs.workers import WorkerWorlds
 from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import Setting, environment
 from irlcli.seeds import derive
@@ -251,12 +251,6 @@ class PPOTrainer:
         Raises:
             StageFailed: the policy's parameters stopped being finite, or a worker process died.
         """
-        try:
-            return self._train_round(index, reward)
-        except WorkerFailed as error:
-            raise StageFailed(str(error), "run the same command again to go on") from error
-
-    def _train_round(self, index: int, reward: RewardFunction | None) -> list[Rollout]:
         generator_seed, *world_seeds = derive(
             self._purpose, self._seed, index, 1 + self._venv.num_envs
         )

@@ -187,17 +187,12 @@ class Runner:
             )
             self.console.start(request.label, checkpoints.load() is not None)
             output = scratch.new_output()
+            job = Job(request.parameters, inputs, output, checkpoints, self.console, self.workers)
             with checkpoints.listening():
-                request.stage.run(
-                    Job(
-                        request.parameters,
-                        inputs,
-                        output,
-                        checkpoints,
-                        self.console,
-                        self.workers,
-                    )
-                )
+                try:
+                    request.stage.run(job)
+                except StageFailed as error:
+                    raise StageFailed(f"{request.label}: {error.message}", error.hint) from error
             origin = provenance.record(self.command, self.workers, checkpoints.attempts())
             origin["inputs"] = {role: _address(source) for role, source in sources.items()}
             published = self.store.publish(record, output, origin)

@@ -1,8 +1,8 @@
 """Validated settings: TOML files, profiles, ``--set``.
 
 One file per environment in ``settings/``. Precedence, weakest first: the defaults below, the
-environment's file, its profile, ``--settings FILE``, then flags and ``--set``. Environment
-variables never enter: equal settings give equal artefacts wherever they run.
+environment's file, its profile, ``--settings FILE``, ``--set``, flags. Environment variables
+never enter: equal settings give equal artefacts wherever they run.
 """
 
 import stat
@@ -346,11 +346,22 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Settings:
     except msgspec.ValidationError as error:
         message, _, where = str(error).partition(" - at ")
         field = where.strip("`").removeprefix("$.")
+        if field.startswith("interventions[...]"):
+            knob = next(k for k, v in tree["interventions"].items() if not _is_listed(v))
+            field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
         raise UsageError(f"{field}: {message}", _field_hint(field)) from None
     for knob, values in settings.interventions.items():
         for value in (*values.id, *values.ood):
             parse_settings(env, f"{knob}={value}")
     return settings
+
+
+def _is_listed(values: Any) -> bool:
+    try:
+        msgspec.convert(values, InterventionSettings)
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _check_names(tree: Any, kind: type, path: tuple[str, ...]) -> None:
@@ -410,7 +421,7 @@ def _typed(text: str, kind: Any, field: str) -> Any:
 
 
 def _field_hint(field: str) -> str:
-    """What a field takes: its choices if it has some, else its default as an example."""
+    """What a field takes: its choices if it has some, else a value that it could have."""
     value, kind = Settings(), Settings
     for name in field.split("."):
         name = name.partition("[")[0]
@@ -422,4 +433,4 @@ def _field_hint(field: str) -> str:
         return f"one of: {', '.join(get_args(kind))}"
     if value is UNSET:
         return "it is unset by default"
-    return f"its default is {msgspec.json.encode(value).decode()}"
+    return f"for example {msgspec.json.encode(value).decode()}"

@@ -334,14 +334,18 @@ def test_bad_input_is_one_line_and_a_hint(chains, irl, tmp_path, monkeypatch, ar
     assert said in done.err and "hint:" in done.err and "Traceback" not in done.err
 
 
-def test_a_killed_worker_is_a_named_failure():
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_a_killed_worker_is_a_named_failure(rounds):
+    """Also before the first round, while the trainer is made."""
     worlds = rl.make_worlds("reacher", SETTINGS, 2, workers=2)
-    trainer = make_trainer(worlds)
-    trainer.train_round(0)
+    trainer = make_trainer(worlds) if rounds else None
+    if trainer is not None:
+        trainer.train_round(0)
     (worker, *_) = multiprocessing.active_children()
     worker.kill()
-    with pytest.raises(StageFailed, match=r"worker . .* died: signal 9"):
-        trainer.train_round(1)
+    with pytest.raises(StageFailed, match=r"worker . .* died: signal 9") as caught:
+        (trainer or make_trainer(worlds)).train_round(1)
+    assert caught.value.hint
     assert not multiprocessing.active_children()
     worlds.close()
 

@@ -25,6 +25,7 @@ import gymnasium
 import numpy as np
 
 from irlcli.envs.vector import Ended, VectorWorlds
+from irlcli.errors import StageFailed
 
 _CLOSE_SECONDS = 5.0
 # What a pipe raises whose other end is gone.
@@ -32,8 +33,11 @@ _CLOSED = (EOFError, BrokenPipeError, ConnectionResetError)
 _PLAIN, _PICKLED = b"0", b"1"
 
 
-class WorkerFailed(RuntimeError):
-    """A worker process died, or an environment in it raised an error."""
+class WorkerFailed(StageFailed):
+    """A worker process died, or an environment in it raised an error (exit 1)."""
+
+    def __init__(self, message: str):
+        super().__init__(message, "run the same command again to go on")
 
 
 class _Channel(NamedTuple):

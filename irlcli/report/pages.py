@@ -8,7 +8,7 @@ from html import escape
 
 import pandas as pd
 
-from irlcli.report.results import TITLES, Plan, Report, Table, commits, duration
+from irlcli.report.results import TITLES, Plan, Report, Table, commits, duration, lineage
 from irlcli.report.tables import latex_table, markdown_table
 
 
@@ -33,18 +33,20 @@ def markdown(plan: Plan, report: Report) -> str:
     parts.append(
         f"`{plan.kind}.csv`: a row per cell. `seeds.csv`: every seed's point. `comparisons.csv`. "
         f"`{plan.kind}.html`: all of this with learning curves and lineage in one page. "
-        f"`{plan.kind}.tex`: booktabs. `{plan.kind}.png`, `.pdf`: every seed, the mean, its 95 % "
+        f"`{plan.kind}.tex`: booktabs and longtable. `{plan.kind}.png`, `.pdf`: every seed, the mean, its 95 % "
         "interval.\n"
     )
     return "\n".join(parts)
 
 
 def _made(plan: Plan) -> str:
-    states = {state for run in plan.runs.values() for state in run.code}
+    # An intermediate result that nothing shown stands on is not counted.
+    runs = [plan.runs[i] for i in lineage(plan, (c.run for c in plan.cells if c.run))]
+    states = {state for run in runs for state in run.code}
     named = sorted({state.commit or "unknown" for state in states})
     dirty = " with uncommitted changes" if any(state.dirty for state in states) else ""
-    total = duration(sum(run.seconds or 0.0 for run in plan.runs.values()))
-    return f"on {len(plan.runs)} runs, {total} in all, made at commit {', '.join(named)}{dirty}."
+    total = duration(sum(run.seconds or 0.0 for run in runs))
+    return f"on {len(runs)} runs, {total} in all, made at commit {', '.join(named)}{dirty}."
 
 
 # HTML

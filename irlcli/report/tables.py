@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Sequence
 
+# A float that is longer than a page is cut off.
+_PAGE_ROWS = 40
 _LATEX = {
     "\\": r"\textbackslash{}",
     "&": r"\&",
@@ -30,25 +32,18 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str
 
 
 def latex_table(columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
-    """A LaTeX table for the package booktabs."""
+    """A LaTeX table for the package booktabs; if it may not fit a page, also for longtable."""
     body = [columns, *rows]
     lines = [" & ".join(latex_text(cell) for cell in line) + r" \\" for line in body]
-    return "\n".join(
-        [
-            r"\begin{table}",
-            r"\centering",
-            *([rf"\caption{{{latex_text(caption)}}}"] if caption else []),
-            rf"\begin{{tabular}}{{{'l' * len(columns)}}}",
-            r"\toprule",
-            lines[0],
-            r"\midrule",
-            *lines[1:],
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )
+    rules = [r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
+    captions = [rf"\caption{{{latex_text(caption)}}}"] if caption else []
+    form = "l" * len(columns)
+    if len(rows) > _PAGE_ROWS:
+        captions = [line + r" \\" for line in captions]
+        begin = [rf"\begin{{longtable}}{{{form}}}", *captions]
+        return "\n".join([*begin, *rules, r"\end{longtable}", ""])
+    begin = [r"\begin{table}", r"\centering", *captions, rf"\begin{{tabular}}{{{form}}}"]
+    return "\n".join([*begin, *rules, r"\end{tabular}", r"\end{table}", ""])
 
 
 def latex_text(text: str) -> str:

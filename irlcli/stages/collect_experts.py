@@ -52,10 +52,12 @@ def request(
     counts = tuple(episodes) if episodes else (config.demonstrations.episodes,)
     if len(counts) == 1:
         counts *= len(settings_)
-    if len(counts) != len(settings_) or min(counts) < 1:
+    if min(counts) < 1:
+        raise UsageError(f"{min(counts)} episodes are no demonstrations", "record at least 1")
+    if len(counts) != len(settings_):
         raise UsageError(
             f"{len(counts)} episode counts for {len(settings_)} settings",
-            "give one count for all settings or one for each, all at least 1",
+            "give one count for all settings or one for each",
         )
     if sum(counts) > _MOST_EPISODES:
         raise UsageError(

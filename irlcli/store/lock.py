@@ -18,6 +18,7 @@ def locked(
     shared: bool = False,
     wait: bool = False,
     on_wait: Callable[[str], None] | None = None,
+    what: str = "this",
 ) -> Iterator[None]:
     """Hold ``path`` locked; the kernel releases it however the process ends.
 
@@ -26,6 +27,7 @@ def locked(
         shared: several holders may share it.
         wait: wait for the present holder instead of raising.
         on_wait: told once, with the holder's description, before waiting.
+        what: what it stands for, in an error's words.
 
     Raises:
         Busy: held by another process and ``wait`` is false.
@@ -41,7 +43,7 @@ def locked(
             holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
             holder = holder or "another process"
             if not wait:
-                raise Busy(f"{holder} is at work on this already", "try again later") from None
+                raise Busy(f"{holder} is at work on {what} already", "try again later") from None
             if on_wait is not None:
                 on_wait(holder)
             fcntl.flock(descriptor, mode)

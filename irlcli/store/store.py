@@ -361,10 +361,19 @@ class Store:
         if id16 is None:
             return None
         if not (self.root / id16).is_dir():
-            raise NotFound(
-                f"the name {name!r} points to {id16}, which is gone", "name another with `irl name`"
-            )
+            raise self._gone(name, id16)
         return self.get(id16)
+
+    def _gone(self, name: str, id16: str) -> NotFound:
+        places = sorted(self._quarantine().glob(f"{id16}-*"))
+        if not places:
+            hint = "name another with `irl name`"
+            return NotFound(f"the name {name!r} points to {id16}, which is gone", hint)
+        command = _recorded_command(places[-1])
+        return NotFound(
+            f"the name {name!r} points to {id16}, which was damaged and is now in {places[-1]}",
+            f"compute it again: {command}" if command else "compute it again",
+        )
 
     def _by_prefix(self, prefix: str) -> Artefact | None:
         if not re.fullmatch(_PREFIX, prefix):
@@ -398,15 +407,18 @@ class Store:
                 "which would read as an id",
             )
 
-    def set_name(self, name: str, artefact: Artefact) -> None:
-        """Let ``name`` stand for ``artefact``; rewritten only if that changes something.
+    def set_name(self, name: str, artefact: Artefact) -> str | None:
+        """Let ``name`` stand for ``artefact``; returns the id of another that it stood for.
 
         Raises:
             UsageError: as :meth:`check_name`.
         """
         self.check_name(name)
-        if self._named(name) != artefact.id:
-            write_durably(self._names() / name, artefact.id.encode() + b"\n")
+        before = self._named(name)
+        if before == artefact.id:
+            return None
+        write_durably(self._names() / name, artefact.id.encode() + b"\n")
+        return before
 
     # Writing
 
@@ -686,7 +698,7 @@ class Store:
         """
         if not self._locks().is_dir():
             return [], []
-        with locked(self._locks() / "gc"):
+        with locked(self._locks() / "gc", what=f"the store {self.root}"):
             artefacts, work = self.garbage(grace_seconds), self.stale_work(grace_seconds)
             pointers: dict[str, list[Path]] = {}
             for pointer, id16 in _pointers(self._keys()):

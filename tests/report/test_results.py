@@ -284,6 +284,24 @@ def test_markdown_and_latex_escape_what_they_must():
     assert "a & b \\\\" in table and r"\begin{tabular}{ll}" in table
 
 
+def test_a_latex_table_longer_than_a_page_breaks():
+    table = latex_table(["a", "b"], [["1", "2"]] * 60, "C")
+    assert r"\begin{longtable}{ll}" in table and r"\begin{table}" not in table
+    assert r"\caption{C} \\" in table and table.count("1 & 2") == 60
+
+
+def test_what_nothing_stands_on_is_not_counted():
+    plan, points = made(full())
+    said = re.search(
+        r"on \d+ runs, \S+ in all", pages.markdown(plan, results.build(plan, points, {}))
+    )
+    more = replace(plan, runs=plan.runs | {"e" * 16: evaluation(0)})
+    again = re.search(
+        r"on \d+ runs, \S+ in all", pages.markdown(more, results.build(more, points, {}))
+    )
+    assert said[0].startswith(f"on {len(plan.runs)} runs") and again[0] == said[0]
+
+
 def test_markdown_tables_are_rectangular():
     plan, points = made(full())
     text = pages.markdown(plan, results.build(plan, points, {}))

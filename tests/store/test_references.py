@@ -224,7 +224,8 @@ def test_naming_rewrites_only_what_changes(empty_store, artefact, publish):
     empty_store.set_name("best", artefact)
     assert path.stat().st_mtime == 1
     other = publish(empty_store, parameters={"seed": 1}).artefact
-    empty_store.set_name("best", other)
+    assert empty_store.set_name("best", artefact) is None
+    assert empty_store.set_name("best", other) == artefact.id
     assert path.stat().st_mtime > 1
     assert empty_store.names() == {"best": other.id}
 
@@ -234,6 +235,19 @@ def test_a_name_of_something_that_is_gone(empty_store, artefact):
     artefact.directory.rename(empty_store.root / ".quarantine" / "gone")
     with pytest.raises(NotFound, match=f"'best' points to {artefact.id}, which is gone"):
         empty_store.resolve("best")
+
+
+def test_a_name_of_something_damaged_says_how_to_make_it_again(empty_store, artefact):
+    empty_store.set_name("best", artefact)
+    output = next(artefact.directory / o.path for o in artefact.manifest.outputs)
+    output.chmod(0o644)
+    output.write_bytes(b"other bytes")
+    assert list(empty_store.verify([artefact.id])) == [artefact.id]
+    (place,) = (empty_store.root / ".quarantine").iterdir()
+    with pytest.raises(NotFound, match=f"'best' points to {artefact.id}") as caught:
+        empty_store.resolve("best")
+    assert str(place) in caught.value.message
+    assert caught.value.hint.startswith("compute it again")
 
 
 @pytest.mark.parametrize("content", [b"", b"../../etc", b"\xff\xff", b"zzz"])
