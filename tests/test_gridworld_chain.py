@@ -161,7 +161,7 @@ SIZE = ["--set", "gridworld.size=1024"]
         ([*COLLECT, "path-group=4"], "out of range"),
         ([*COLLECT, "path-group=-1"], "out of range"),
         ([*COLLECT, "blocked=2x"], "not as multiplier"),
-        ([*COLLECT, "path-group=1,2", "--episodes", "3,0"], "2 settings"),
+        ([*COLLECT, "path-group=1,2", "--episodes", "3,0"], "0 episodes"),
         ([*COLLECT, "path-group=1", "--set", "gridworld.horizon=5"], "8 steps away"),
         ([*COLLECT, "path-group=1", "--set", "gridworld.size=4"], ">= 5"),
         ([*COLLECT, "path-group=1", "--set", "gridworld.p_slip=1"], "< 1.0"),

@@ -710,7 +710,7 @@ def test_ls_tells_what_an_artefact_was_learned_by(irl, store_copy):
     (transfer,) = (row for row in listed.splitlines() if store_copy.transfer in row)
     (score,) = (row for row in listed.splitlines() if store_copy.evaluation in row)
     made = Store(store_copy.path).get(store_copy.airl).manifest.record.parameters["airl"]
-    learned = f"of train-airl irm lambda {made['penalty_weight']} seed 0"
+    learned = f"of train-airl irm lambda {made['penalty_weight']:g} seed 0"
     assert learned in transfer
     assert f"of transfer seed 0 {learned}" in score
     shutil.rmtree(store_copy.path / store_copy.airl)
