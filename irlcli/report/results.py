@@ -244,7 +244,7 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
     notes = []
     for r in cells.itertuples():
         if _failed(r):
-            share = "" if r.of_expert is pd.NA else f" ({r.of_expert:.0%} of the expert's return)"
+            share = "" if r.of_expert is pd.NA else f" ({r.of_expert:.1%} of the expert's return)"
             notes.append(
                 f"Not imitated: {r.row}, {TITLES[r.agent]}: in distribution the student stays below "
                 f"{IMITATED:.0%} of the expert{share}; a gap to another method is noise."

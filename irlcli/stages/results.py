@@ -169,4 +169,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 2, run)
+STAGE = Stage("report", 3, run)
