@@ -790,7 +790,9 @@ def verify(
     """Check stored bytes against their digests; damaged artefacts go to quarantine."""
     if ref is None:
         _check_there(session)
-    ids = session.store.ids() if ref is None else [_artefact(session, ref).id]
+        ids = session.store.ids()
+    else:
+        ids = [_artefact(session, ref).id]
     found = session.store.verify(ids, quick)
     newer = [id16 for id16, damage in found.items() if damage.newer]
     damaged = {id16: damage for id16, damage in found.items() if not damage.newer}

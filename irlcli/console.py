@@ -237,10 +237,10 @@ def _require_tensorboard(directory: Path) -> None:
     """Say before the work, not after its first round, that the mirror cannot be written."""
     import importlib.util
 
+    if directory.exists() and not directory.is_dir():
+        raise UsageError(f"--tensorboard {directory} is no directory", "name one, or a new one")
     if importlib.util.find_spec("tensorboard") is None:
         raise UsageError(
             "--tensorboard needs the package tensorboard, which is not installed",
             f"{sys.executable} -m pip install tensorboard, or leave --tensorboard away",
         )
-    if directory.exists() and not directory.is_dir():
-        raise UsageError(f"--tensorboard {directory} is no directory", "name one, or a new one")

@@ -272,6 +272,9 @@ def _stack(env: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Setting
     """The settings that ``layers`` of (source, values) lead to, later ones winning."""
     tree: dict[str, Any] = {}
     for source, values in layers:
+        if tree and not values:
+            # The standard profile, usually: every command comes through here.
+            continue
         tree = _merge(tree, values)
         try:
             settings = _convert(env, tree)
