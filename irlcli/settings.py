@@ -90,6 +90,9 @@ class InterventionSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fie
     expert_ppo: PPOSettings | UnsetType = UNSET
 
 
+_INTERVENTIONS = dict[str, InterventionSettings]
+
+
 class ExpertSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A policy trained on the true reward. ``bar`` is the mean true return that it must reach."""
 
@@ -203,7 +206,7 @@ class Figure2Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class Settings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Everything that can be set for one environment."""
 
-    interventions: dict[str, InterventionSettings] = {}
+    interventions: _INTERVENTIONS = {}
     expert: ExpertSettings = ExpertSettings()
     demonstrations: DemonstrationSettings = DemonstrationSettings()
     airl: AIRLSettings = AIRLSettings()
@@ -367,18 +370,24 @@ def _is_listed(values: Any) -> bool:
     return True
 
 
-def _check_names(tree: Any, kind: type, path: tuple[str, ...]) -> None:
-    """Refuse unknown names here: msgspec names them without a suggestion."""
+def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
+    """Refuse unknown names, and values that are no tables: msgspec says too little of either."""
+    if kind == _INTERVENTIONS:
+        fields = dict.fromkeys(tree, InterventionSettings) if isinstance(tree, Mapping) else {}
+        inside = "[interventions.KNOB] with id and ood"
+    else:
+        fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+        inside = f"[{'.'.join(path)}] with some of: {', '.join(fields)}"
     if not isinstance(tree, Mapping):
-        return
-    fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+        raise UsageError(f"{'.'.join(path)}: a table is needed, not {tree!r}", f"write {inside}")
     for name, value in tree.items():
         if name not in fields:
             where = ".".join((*path, str(name)))
             raise UsageError(f"no setting {where!r}", suggest(str(name), fields))
-        inner = fields[name]
-        if isinstance(inner, type) and issubclass(inner, Struct):
-            _check_names(value, inner, (*path, name))
+        for inner in (fields[name], *get_args(fields[name])):
+            if inner == _INTERVENTIONS or isinstance(inner, type) and issubclass(inner, Struct):
+                _check_names(value, inner, (*path, name))
+                break
 
 
 def _override(item: str) -> dict[str, Any]:
@@ -399,7 +408,7 @@ def _override(item: str) -> dict[str, Any]:
                 f"--set {item!r}: no setting {dotted.strip()!r}", suggest(name, fields)
             )
         kind = fields[name]
-        if kind == dict[str, InterventionSettings]:
+        if kind == _INTERVENTIONS:
             raise UsageError(
                 f"--set {item!r}: interventions are not set this way", "use --intervention or --ood"
             )
