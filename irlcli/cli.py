@@ -788,8 +788,11 @@ def verify(
     quick: Annotated[bool, typer.Option("--quick", help="Compare sizes, hash nothing.")] = False,
 ) -> None:
     """Check stored bytes against their digests; damaged artefacts go to quarantine."""
+    names: dict[str, str] = {}
     if ref is None:
         _check_there(session)
+        # First the names: what is named is there before its name.
+        names = session.store.names()
         ids = session.store.ids()
     else:
         ids = [_artefact(session, ref).id]
@@ -799,9 +802,13 @@ def verify(
     for id16 in newer:
         session.console.warn(f"not checked: {found[id16].problems[0]}")
     checked = len(ids) - len(newer)
+    dangling = {name: id16 for name, id16 in names.items() if id16 not in ids}
+    for name, id16 in dangling.items():
+        session.console.warn(f"the name {name!r} points to {id16}, which is not there")
     result = {
         "checked": checked,
         "newer": newer,
+        "dangling": dangling,
         "damaged": {
             id16: {
                 "problems": damage.problems,

@@ -385,7 +385,7 @@ def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
             where = ".".join((*path, str(name)))
             raise UsageError(f"no setting {where!r}", suggest(str(name), fields))
         for inner in (fields[name], *get_args(fields[name])):
-            if inner == _INTERVENTIONS or isinstance(inner, type) and issubclass(inner, Struct):
+            if inner == _INTERVENTIONS or (isinstance(inner, type) and issubclass(inner, Struct)):
                 _check_names(value, inner, (*path, name))
                 break
 

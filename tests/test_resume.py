@@ -1,5 +1,6 @@
 """Killed and interrupted stages go on, and end in the same bytes as if nothing had happened."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -65,10 +66,8 @@ def checkpoints(store):
     """Paths and modification times of all checkpoints now."""
     found = {}
     for path in Path(store).glob(".work/*/checkpoint"):
-        try:
+        with contextlib.suppress(FileNotFoundError):
             found[path] = path.stat().st_mtime_ns
-        except FileNotFoundError:
-            pass
     return found
 
 

@@ -74,7 +74,7 @@ def test_the_cap_on_the_deviation_holds_after_every_round():
 
 def test_a_cap_needs_continuous_actions():
     worlds = rl.make_worlds("lunar-lander", [parse_setting("lunar-lander", "bounce=0.5")], 1)
-    with pytest.raises(UsageError, match="ppo.log_std_max needs continuous actions"):
+    with pytest.raises(UsageError, match=r"ppo\.log_std_max needs continuous actions"):
         rl.PPOTrainer(worlds, PPOSettings(n_envs=1, log_std_max=-1.0), 1000, 0, "test")
 
 

@@ -34,7 +34,7 @@ def test_statistics_are_over_seeds():
 
 def test_a_seed_that_comes_twice_is_refused():
     twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
-    with pytest.raises(UsageError, match="airl-erm zero-shot in bounce=0.9 has seed 3 twice"):
+    with pytest.raises(UsageError, match=r"airl-erm zero-shot in bounce=0\.9 has seed 3 twice"):
         rows(twice)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import time
@@ -84,6 +85,18 @@ def test_verify_says_in_json_what_is_damaged(irl, empty_store, publish):
     assert "reward.pt" in damage["problems"][0] and "other bytes" in damage["problems"][0]
     assert damage["command"] == "irl train-airl"
     assert Path(damage["quarantine"], "reward.pt").exists()
+
+
+def test_verify_says_which_names_point_to_nothing(irl, empty_store, publish):
+    kept, removed = (publish(empty_store, parameters={"seed": seed}).artefact for seed in (0, 1))
+    empty_store.set_name("kept", kept)
+    empty_store.set_name("removed", removed)
+    assert "points to" not in irl("verify", "--store", empty_store.root).err
+    shutil.rmtree(removed.directory)
+    result = irl("verify", "--json", "--store", empty_store.root)
+    assert (result.code, json.loads(result.out)["dangling"]) == (0, {"removed": removed.id})
+    assert f"the name 'removed' points to {removed.id}, which is not there" in result.err
+    assert "'kept'" not in result.err
 
 
 def manifests_read(monkeypatch) -> list[str]:
