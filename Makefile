@@ -165,9 +165,9 @@ CELLS   = $(addprefix $(NAMES)/,$(call $(1),$(TAG).$(2),$(METHODS),$(SEEDS)))
 
 # $(1) ENV.KNOB, $(2) ENV, $(3) KNOB
 define ROW
-.PHONY: $(1).returns $(1).zero-shot-returns $(1).id-returns $(1).expert-id-returns
-$(1).returns: $$(call CELLS,RETURNS,$(1))
-$(1).zero-shot-returns: $$(call CELLS,ZERO,$(1))
+.PHONY: $(addprefix $(1).,returns zero-shot-returns id-returns expert-id-returns carried-returns)
+$(1).returns: $(1).carried-returns $$(call CELLS,RETURNS,$(1))
+$(1).zero-shot-returns: $(1).carried-returns $$(call CELLS,ZERO,$(1))
 $(1).id-returns: $(1).expert-id-returns $$(addsuffix .id-returns,$$(call CELLS,RUNS,$(1)))
 
 $(NAMES)/$(TAG).$(1).demos: $(READY) FORCE
@@ -185,6 +185,11 @@ $(NAMES)/$(TAG).$(1).idle-returns: $(READY) FORCE
 # An evaluation for each setting, too many for one name. The report's name keeps them from gc.
 $(1).expert-id-returns: $(NAMES)/$(TAG).$(1).demos
 	$$(RUN) $(IRL) evaluate --expert --env $(2) --intervention $(3) $$(COMMON)
+
+# The experts trained in, in the other settings: what it earns to learn no reward.
+$(1).carried-returns: $(NAMES)/$(TAG).$(1).demos
+	$$(RUN) $(IRL) evaluate --expert --trained-in $(3) --env $(2) --ood $(3) $$(COMMON)
+	$$(RUN) $(IRL) evaluate --expert --trained-in $(3) --env $(2) --intervention $(3) $$(COMMON)
 
 $$(foreach m,$(METHODS),$$(foreach s,$(SEEDS),$$(eval $$(call CELL,$(TAG).$(1).$$(m).$$(s),$(TAG).$(1),$(3),$$(m),$$(s)))))
 endef

@@ -443,6 +443,10 @@ def evaluate(
     session: Session,
     policy: Annotated[str | None, typer.Option(help="policy.pt or its artefact.")] = None,
     expert: Annotated[bool, typer.Option("--expert", help="The expert of each setting.")] = False,
+    trained_in: Annotated[
+        str | None,
+        typer.Option(help="With --expert: those of KNOB=VALUE,... or KNOB (ID values), in each."),
+    ] = None,
     random: Annotated[bool, typer.Option("--random", help="Uniformly random actions.")] = False,
     idle: Annotated[bool, typer.Option("--idle", help="Does nothing.")] = False,
     ood: Annotated[
@@ -466,11 +470,14 @@ def evaluate(
         )
     if ood is not None and intervention is not None:
         raise UsageError("--ood and --intervention both name settings", "give one of them")
+    if trained_in is not None and not expert:
+        raise UsageError("--trained-in says which experts, and none is evaluated", "add --expert")
     if policy is not None:
         artefacts = _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name)
     else:
         agent = "expert" if expert else "random" if random else "idle"
-        artefacts = _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name)
+        places = ood, intervention
+        artefacts = _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, name)
     if artefacts and not session.as_json:
         from irlcli.references import evaluation
 
@@ -496,9 +503,10 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
     return session.deliver([request], name)
 
 
-def _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name):
+def _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, name):
     from irlcli.stages import From, evaluate, train_expert
 
+    ood, intervention = places
     if env is None or (ood is None and intervention is None):
         raise UsageError(
             f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"
@@ -511,20 +519,24 @@ def _evaluate_agent(session, agent, ood, intervention, env, episodes, seed, name
     if agent != "expert":
         request = evaluate.request(env, settings, config.evaluation, agent=agent, seed=seed)
         return session.deliver([request], name)
-    if name is not None and len(settings) > 1:
+    if trained_in is None:
+        wanted = [(setting, [setting]) for setting in settings]
+    else:
+        wanted = [(own, settings) for own in _settings(env, config, trained_in, "id")]
+    if name is not None and len(wanted) > 1:
         raise UsageError(
-            f"--name {name!r} cannot stand for {len(settings)} evaluations",
+            f"--name {name!r} cannot stand for {len(wanted)} evaluations",
             "evaluate the expert of one setting at a time to name it",
         )
     requests = [
         evaluate.request(
             env,
-            [setting],
+            measured,
             config.evaluation,
-            From(train_expert.request(env, setting, 0, config.expert_of(setting)), "policy.pt"),
+            From(train_expert.request(env, own, 0, config.expert_of(own)), "policy.pt"),
             seed=seed,
         )
-        for setting in settings
+        for own, measured in wanted
     ]
     return session.deliver(requests, name)
 

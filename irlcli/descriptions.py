@@ -116,10 +116,11 @@ class Dataset(Struct, frozen=True, kw_only=True):
 
 
 class Subject(Struct, frozen=True, kw_only=True):
-    """Whom an evaluation measured."""
+    """Whom an evaluation measured; ``settings`` are those that a policy was trained in."""
 
     agent: Agent
     env: str
+    settings: tuple[str, ...] = ()
     method: AdversarialMethod | None = None
     seed: int | None = None
     reward_seed: int | None = None

@@ -302,10 +302,16 @@ def _row(
             {},
         )
     )
-    planned += [
-        _Planned(results.Cell(name, "expert", "id", place=str(e)), measured([e], expert(e)), {})
-        for e in trained
-    ]
+    for e in trained:
+        wanted = (
+            ("expert", "id", [e]),
+            ("carried", "ood", unseen),
+            ("carried", "id", trained),
+        )
+        planned += [
+            _Planned(results.Cell(name, agent, m, place=str(e)), measured(places, expert(e)), {})
+            for agent, m, places in wanted
+        ]
     chosen = {}
     for method in methods:
         for seed in seeds:

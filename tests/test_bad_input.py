@@ -167,6 +167,10 @@ WRONG = [
     ("evaluate --policy airl --expert", 2, "2 agents"),
     ("evaluate --random", 2, "--random"),
     ("evaluate --expert --env lunar-lander", 2, "--expert"),
+    (f"evaluate --idle --trained-in bounce {LANDER}", 2, "--trained-in"),
+    ("evaluate --policy airl --trained-in bounce", 2, "--trained-in"),
+    (f"evaluate --expert --trained-in bonce {LANDER}", 2, "bonce"),
+    (f"evaluate --expert --trained-in bounce {LANDER} --name both", 2, "'both'"),
     ("evaluate --policy airl --ood 2x --intervention bounce=1", 2, "--ood and --intervention"),
     (f"evaluate --expert {LANDER},1.25x --name both", 2, "'both'"),
     # References of the wrong kind

@@ -36,6 +36,8 @@ def table_store(tmp_path_factory, run_irl):
         irl("evaluate", agent, *where)
     irl("collect-experts", *ROW, "--intervention", "engine-power", "--name", "demos")
     irl("evaluate", "--expert", *ROW, "--intervention", "engine-power")
+    for use in ("--ood", "--intervention"):
+        irl("evaluate", "--expert", "--trained-in", "engine-power", *ROW, use, "engine-power")
     for method in ("erm", "irm"):
         for seed in "01":
             name = f"{method}.{seed}"
@@ -99,6 +101,34 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
     assert erm["mean"] == pytest.approx(mine.mean(), rel=1e-5)
     assert erm["deviation"] == pytest.approx(mine.std(), rel=1e-4)
     assert cells.loc[("lunar-lander bounce", "erm", "transfer"), "seeds"] == 0
+
+
+def test_experts_are_carried_over_to_every_setting(report, irl, table_store):
+    directory = Path(report("table1", table_store, *ROW).out.strip())
+    points = pd.read_csv(directory / "seeds.csv")
+    points = points[points["row"] == "lunar-lander engine-power"]
+    carried = points[points["agent"] == "carried"]
+    trained = ["engine-power=1.25x", "engine-power=1x"]
+    unseen = carried[carried["measure"] == "ood"]
+    assert sorted(unseen["expert_of"]) == trained
+    assert set(unseen["setting"]) == {"engine-power=1.5x"}
+    inside = carried[carried["measure"] == "id"].set_index(["expert_of", "setting"])["true_return"]
+    assert sorted(inside.index) == [(own, place) for own in trained for place in trained]
+    experts = points[(points["agent"] == "expert") & (points["measure"] == "id")]
+    for own, place, value in zip(
+        experts["expert_of"], experts["setting"], experts["true_return"], strict=True
+    ):
+        assert own == place and inside[own, own] == value
+    cells = pd.read_csv(directory / "table1.csv").set_index(["row", "agent", "measure"])
+    for measure, values in (("ood", unseen["true_return"]), ("id", inside)):
+        mean = cells.loc[("lunar-lander engine-power", "carried", measure), "mean"]
+        assert mean == pytest.approx(values.mean(), rel=1e-5)
+    # The command says whose expert it is where that is not the setting's own.
+    where = [*ROW, "--intervention", "engine-power", "--trained-in", "engine-power=1x"]
+    small = ["--store", table_store, "--profile", "smoke", *SMALL]
+    said = irl("evaluate", "--expert", *where, *small).err
+    assert re.search(r"^expert +lunar-lander engine-power=1x ", said, re.M)
+    assert re.search(r"^expert of engine-power=1x +lunar-lander engine-power=1.25x ", said, re.M)
 
 
 def test_what_is_missing_is_said(report, table_store):

@@ -26,7 +26,7 @@ COLOURS = {
     "erm-balanced": "#009E73",
     "irm-shuffled": "#CC79A7",
 }
-_LINES = {"expert": "-", "random": "--", "idle": ":"}
+_LINES = {"expert": "-", "carried": "-.", "random": "--", "idle": ":"}
 _LEARNING = {
     "true_return": "true return",
     "progress": "progress",
@@ -108,7 +108,7 @@ def _panel(axis, plan: Plan, report: Report, row, measure: str) -> None:
             lw=0.9,
             ls=_LINES[agent],
             alpha=0.7,
-            label=agent,
+            label=TITLES[agent],
         )
     for x, method in enumerate(plan.methods):
         colour = COLOURS[method]

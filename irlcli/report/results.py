@@ -19,6 +19,7 @@ TITLES = {
     "erm-balanced": "ERM-balanced",
     "irm-shuffled": "IRM, labels shuffled",
     "expert": "expert",
+    "carried": "experts, carried over",
     "random": "random",
     "idle": "idle",
 }
@@ -27,7 +28,7 @@ MEASURES = {
     "zero-shot": "Zero-shot: the student, in the unseen setting",
     "id": "In distribution: the student, mean over the settings trained in",
 }
-BASELINES = ("expert", "random", "idle")
+BASELINES = ("expert", "carried", "random", "idle")
 # The comparison the paper makes first, then those with the controls.
 _PAIRS = (("irm", "erm"), ("irm", "erm-balanced"), ("irm", "irm-shuffled"))
 IMITATED = 0.8
@@ -65,7 +66,8 @@ class Report:
 
     Attributes:
         points: a row per evaluation and setting: ``row``, ``agent``, ``measure``, ``seed``,
-            ``setting``, ``true_return``, ``progress``, ``episodes``, ``evaluation`` (its id).
+            ``expert_of`` (the setting that an expert was trained in), ``setting``, ``true_return``,
+            ``progress``, ``episodes``, ``evaluation`` (its id).
         cells: a row per row, agent and measure.
         comparisons: a row per row, measure and pair of methods.
         tables: the same for people.
@@ -130,7 +132,7 @@ def _cells(plan: Plan, points: pd.DataFrame) -> pd.DataFrame:
     for row in plan.rows:
         wanted = [(agent, "ood") for agent in BASELINES]
         if "id" in plan.measures:
-            wanted.append(("expert", "id"))
+            wanted += [("expert", "id"), ("carried", "id")]
         wanted += [(method, m) for m in plan.measures for method in plan.methods]
         for agent, measure in wanted:
             values = sample(points, row.name, agent, measure)
@@ -161,13 +163,14 @@ def _cells(plan: Plan, points: pd.DataFrame) -> pd.DataFrame:
     table = pd.DataFrame(found)
     experts = table[(table["agent"] == "expert") & (table["measure"] == "id") & table["complete"]]
     experts = experts.set_index("row")["mean"].to_dict()
-    students = table["agent"].isin(plan.methods) & (table["measure"] == "id")
     of_expert, imitated = [], []
-    for r, is_student in zip(table.itertuples(), students, strict=True):
+    for r in table.itertuples():
         expert, mean = experts.get(r.row), None if pd.isna(r.mean) else r.mean
-        known = is_student and expert is not None and mean is not None
-        of_expert.append(mean / expert if known and expert > 0 else None)
-        imitated.append(imitates(mean, expert) if known else None)
+        is_student = r.agent in plan.methods
+        known = r.measure == "id" and expert is not None and mean is not None
+        compared = known and (is_student or (r.agent == "carried" and r.complete))
+        of_expert.append(mean / expert if compared and expert > 0 else None)
+        imitated.append(imitates(mean, expert) if known and is_student else None)
     return table.assign(
         of_expert=pd.array(of_expert, "Float64"), imitated=pd.array(imitated, "boolean")
     )
@@ -357,7 +360,8 @@ def _cell_text(cell: Any) -> str:
 def _main_table(plan: Plan, measure: str, cells: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """A line per row, one more for its progress, and one for the paper's numbers."""
     baseline = "id" if measure == "id" else "ood"
-    agents = [*plan.methods, "expert"] + ([] if measure == "id" else ["random", "idle"])
+    agents = [*plan.methods, "expert", "carried"]
+    agents += [] if measure == "id" else ["random", "idle"]
     first = comparisons[(comparisons["x"] == "irm") & (comparisons["y"] == "erm")]
     tested = {r.row: r for r in first[first["measure"] == measure].itertuples()}
     lines = []
@@ -376,9 +380,10 @@ def _main_table(plan: Plan, measure: str, cells: pd.DataFrame, comparisons: pd.D
         if any(not pd.isna(own[a].progress) for a in agents):
             lines.append([where, "progress", *(_number(own[a].progress) for a in agents), "", ""])
         if measure == "id":
-            ratios = [own[a].of_expert for a in plan.methods]
-            shares = ["-" if r is pd.NA else f"{r:.0%}" for r in ratios]
-            lines.append([where, "of the expert", *shares, "", "", ""])
+            ratios = {a: own[a].of_expert for a in agents if a != "expert"}
+            shares = {a: "-" if r is pd.NA else f"{r:.0%}" for a, r in ratios.items()}
+            texts = (shares.get(a, "") for a in agents)
+            lines.append([where, "of the expert", *texts, "", ""])
         printed = paper.TABLE1.get((row.env, row.knob))
         if plan.kind == "table1" and measure == "transfer" and printed is not None:
             texts = {
@@ -391,6 +396,8 @@ def _main_table(plan: Plan, measure: str, cells: pd.DataFrame, comparisons: pd.D
         "Mean true return ± standard deviation over seeds. p: Welch, AIRL-IRM against AIRL-ERM; "
         "Holm: over the rows that have a p-value. (3/5): seeds there are of those wanted. "
         "† not imitated in distribution. ‡ made on more than one commit or set of libraries. "
+        "Experts, carried over: the policies of the experts trained in, each measured in every "
+        "setting that the students are, their mean: what it earns to learn no reward. "
         "Progress: the part of the return that walking or reaching earned (an idle ant earns about "
         "600 for being alive)."
     )
@@ -455,7 +462,7 @@ def _cell_table(cells: pd.DataFrame) -> Table:
     note = (
         "Interval: 95 % of the mean by the percentile bootstrap over seeds, too narrow with few. "
         "IQM: mean of the middle half of the seeds. The expert, the random and the idle agent are "
-        "one policy each."
+        "one policy each, the experts carried over one for each setting trained in."
     )
     columns = ["row", "agent", "measure", "seeds", "mean", "sd", "95 %", "IQM", "progress"]
     return Table("Every cell", note, columns, lines, heads=3)

@@ -53,12 +53,13 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
         policy = summary.policy
         order = _ORDER.index(policy.agent)
         for item in summary.settings:
-            key = (order, agent_name(policy), policy.env, item.setting)
+            agent = agent_name(policy, item.setting)
+            key = (order, agent, policy.env, item.setting)
             values = item.mean_return, item.episodes, item.mean_progress
             seed = policy.seed if policy.reward_seed is None else policy.reward_seed
             if (*key, seed) in seen:
                 raise UsageError(
-                    f"{agent_name(policy)} in {item.setting} has seed {seed} twice",
+                    f"{agent} in {item.setting} has seed {seed} twice",
                     "a row's sample is the seed: report runs that differ in anything else apart",
                 )
             seen.add((*key, seed))
@@ -66,7 +67,7 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
             for name in sorted(first | parameters):
                 if first.get(name) != parameters.get(name):
                     raise UsageError(
-                        f"runs of {agent_name(policy)} in {item.setting} differ in {name}: "
+                        f"runs of {agent} in {item.setting} differ in {name}: "
                         f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
                         "a row's sample is the seed: report runs that differ in anything else apart",
                     )
@@ -79,7 +80,12 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
     return found
 
 
-def agent_name(policy: Subject) -> str:
-    """``expert``, ``airl-irm transfer``, ``airl-erm zero-shot``, ``random``, ``idle``."""
+def agent_name(policy: Subject, setting: str) -> str:
+    """``airl-irm transfer``, ``airl-erm zero-shot``, ``random``, ``idle``, or ``expert``.
+
+    One that was trained in another setting than ``setting`` is ``expert of bounce=0.1``.
+    """
     agent = policy.agent
+    if agent == "expert" and policy.settings and setting not in policy.settings:
+        return f"expert of {', '.join(policy.settings)}"
     return f"airl-{policy.method} {_WHAT[agent]}" if agent in _WHAT else agent

@@ -17,10 +17,11 @@ class Cell(msgspec.Struct, frozen=True, kw_only=False):
 
     Attributes:
         row: ``ENV KNOB``.
-        agent: a method, ``expert``, ``random`` or ``idle``.
+        agent: a method, ``expert``, ``random``, ``idle``, or ``carried``: an expert of a setting
+            trained in, measured in others too.
         measure: ``transfer``, ``zero-shot``, ``id``, or ``ood`` of an agent that learns nothing.
         seed: of the reward learning; None for agents without one.
-        place: the setting, where an agent has an evaluation for each.
+        place: the setting of the expert, where there is one for each.
         run: id of the evaluation; empty if it is not there.
         why: what a missing one waits for.
     """
@@ -136,6 +137,7 @@ def run(job: Job) -> None:
         path = directory / "summary.json"
         summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         base = {"row": cell.row, "agent": cell.agent, "measure": cell.measure, "seed": cell.seed}
+        base["expert_of"] = cell.place if cell.agent in ("expert", "carried") else ""
         points += [
             {
                 **base,
@@ -169,4 +171,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 3, run)
+STAGE = Stage("report", 4, run)

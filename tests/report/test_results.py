@@ -98,6 +98,8 @@ def full(student=200.0):
             (row, "random", "ood"): [-200.0],
             (row, "idle", "ood"): [-120.0],
             (row, "expert", "id"): [250.0],
+            (row, "carried", "ood"): [90.0, 130.0],
+            (row, "carried", "id"): [200.0, 300.0],
             (row, "erm", "id"): [student - 1, student, student + 1],
             (row, "irm", "id"): [240.0, 241.0, 242.0],
             (row, "erm", "zero-shot"): [100.0, 110.0, 120.0],
@@ -125,6 +127,23 @@ def test_a_complete_table_has_numbers_and_nothing_to_say():
     assert first["p_welch_holm"] == pytest.approx(2 * first["p_welch"])
     assert first["improvement"] == pytest.approx((1.5 + 2.5 + 3) / 9)
     assert report.notes == []
+
+
+def test_experts_carried_over_are_one_number_and_no_sample():
+    report = results.build(*made(full()), {})
+    row = "lunar-lander bounce"
+    unseen, trained = (cell(report, row, "carried", m) for m in ("ood", "id"))
+    assert (unseen["mean"], unseen["seeds"], unseen["seeds_wanted"]) == (110.0, 1, 1)
+    assert pd.isna(unseen["deviation"]) and pd.isna(unseen["of_expert"])
+    assert (trained["mean"], trained["of_expert"]) == (250.0, 1.0)
+    assert trained["imitated"] is pd.NA
+    for table, value in zip(report.tables, ("110.0", "110.0", "250.0"), strict=False):
+        column = table.columns.index("experts, carried over")
+        assert table.rows[0][column] == value
+    share = next(r for r in report.tables[2].rows if r[1] == "of the expert")
+    assert share[report.tables[2].columns.index("experts, carried over")] == "100%"
+    partly = full() | {(row, "carried", "id"): [200.0, None]}
+    assert cell(results.build(*made(partly), {}), row, "carried", "id")["of_expert"] is pd.NA
 
 
 def test_the_papers_numbers_stand_under_ours():
@@ -173,7 +192,7 @@ def test_missing_seeds_are_counted_and_one_seed_has_no_p():
     assert c["p_welch"].isna().all() and c["p_welch_holm"].isna().all()
     assert "one seed" in c.iloc[0]["why"] and "no seed" in c.iloc[1]["why"]
     assert any(
-        n.startswith("Missing: lunar-lander bounce: 20 of 22") and "AIRL-IRM 1, 2" in n
+        n.startswith("Missing: lunar-lander bounce: 24 of 26") and "AIRL-IRM 1, 2" in n
         for n in report.notes
     )
     assert any(n.startswith("No p-value: lunar-lander bounce: 1 of 3") for n in report.notes)

@@ -32,6 +32,18 @@ def test_statistics_are_over_seeds():
     assert found[0].deviation is None
 
 
+def test_experts_of_other_settings_are_rows_of_their_own():
+    near, far, own = ("bounce=0.5", "bounce=0.1", "bounce=0.9")
+    found = rows(
+        [evaluation("expert", m, 0, settings=(s,)) for m, s in ((1, near), (2, far), (3, own))]
+    )
+    assert [(row.agent, row.mean) for row in found] == [
+        ("expert", 3),
+        ("expert of bounce=0.1", 2),
+        ("expert of bounce=0.5", 1),
+    ]
+
+
 def test_a_seed_that_comes_twice_is_refused():
     twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
     with pytest.raises(UsageError, match=r"airl-erm zero-shot in bounce=0\.9 has seed 3 twice"):
