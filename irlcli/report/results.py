@@ -32,6 +32,8 @@ BASELINES = ("expert", "carried", "random", "idle")
 # The comparison the paper makes first, then those with the controls.
 _PAIRS = (("irm", "erm"), ("irm", "erm-balanced"), ("irm", "irm-shuffled"))
 IMITATED = 0.8
+# Of a discriminator that is right this often, the gradient of the penalty is close to nothing.
+SATURATED = 0.95
 
 
 class Plan(Protocol):
@@ -82,25 +84,33 @@ class Report:
 
 
 Episodes = Mapping[tuple[str, str], Mapping[tuple[str, int], np.ndarray]]
+Learning = Mapping[tuple[str, str, int], pd.DataFrame]
 
 
-def build(plan: Plan, points: pd.DataFrame, episodes: Episodes) -> Report:
+def build(plan: Plan, points: pd.DataFrame, episodes: Episodes, learning: Learning) -> Report:
     """The report on ``points``: a row per evaluation and setting, as in :class:`Report`.
 
-    ``episodes`` are the true returns by (row, measure), then (method, seed).
+    Args:
+        plan: what was wanted, and what is there.
+        points: a row per evaluation and setting.
+        episodes: the true returns by (row, measure), then (method, seed).
+        learning: what ``train-airl`` recorded of each round and setting, by (row, method, seed).
     """
+    ends = _ends(plan, learning)
     cells = _cells(plan, points)
     comparisons = _comparisons(plan, points, cells)
     notes = [
         *_missing(plan),
         *_not_imitated(cells),
+        *_saturated(ends),
         *_identical(episodes),
         *_without_p(comparisons),
         *_left_out(plan),
         *_mixed(plan),
     ]
     tables = [_main_table(plan, m, cells, comparisons) for m in plan.measures]
-    tables += [_comparison_table(comparisons), _cell_table(cells), _budgets(plan), _costs(plan)]
+    tables += [_comparison_table(comparisons), _discriminator_table(ends), _cell_table(cells)]
+    tables += [_budgets(plan), _costs(plan)]
     return Report(points, cells, comparisons, [t for t in tables if t.rows], notes)
 
 
@@ -212,6 +222,26 @@ def _comparisons(plan: Plan, points: pd.DataFrame, cells: pd.DataFrame) -> pd.Da
     return pd.DataFrame(found, columns=[*columns, "improvement", "not_imitated", "why"])
 
 
+def _ends(plan: Plan, learning: Learning) -> pd.DataFrame:
+    """A row per row and method: the discriminator over the last tenth of the rounds.
+
+    Means over settings and seeds; ``share`` is lambda times the penalty over the cross-entropy.
+    """
+    names = ["accuracy", "cross_entropy", "penalty", "penalty_weight", "mean_abs_logit"]
+    found = []
+    for row in plan.rows:
+        for method in plan.methods:
+            runs = [m for (r, a, _), m in learning.items() if (r, a) == (row.name, method)]
+            if not runs:
+                continue
+            last = [m[m["round"] >= 0.9 * m["round"].max()][names].mean() for m in runs]
+            means = pd.concat(last, axis=1).mean(axis=1)
+            share = means["penalty_weight"] * means["penalty"] / means["cross_entropy"]
+            values = {"row": row.name, "agent": method, "seeds": len(runs), "share": share}
+            found.append(values | means.to_dict())
+    return pd.DataFrame(found, columns=["row", "agent", "seeds", "share", *names])
+
+
 # Reservations
 
 
@@ -253,6 +283,16 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
                 f"{IMITATED:.0%} of the expert{share}; a gap to another method is noise."
             )
     return notes
+
+
+def _saturated(ends: pd.DataFrame) -> list[str]:
+    return [
+        f"Saturated: {r.row}, {TITLES[r.agent]}: at the end of training the discriminator is right "
+        f"about {r.accuracy:.1%} of the samples and lambda times the penalty is {r.share:.1%} of "
+        "the cross-entropy: there is hardly a penalty to compare."
+        for r in ends.itertuples()
+        if r.penalty_weight > 0 and r.accuracy >= SATURATED
+    ]
 
 
 def _identical(episodes: Episodes) -> list[str]:
@@ -442,6 +482,38 @@ def _comparison_table(comparisons: pd.DataFrame) -> Table:
     return Table(
         "Comparisons", note, [*columns, "Student, paper", "P(better)", "remark"], lines, heads=3
     )
+
+
+def _discriminator_table(ends: pd.DataFrame) -> Table:
+    lines = [
+        [
+            r.row,
+            TITLES[r.agent],
+            str(r.seeds),
+            f"{r.accuracy:.1%}",
+            f"{r.cross_entropy:.3f}",
+            f"{r.penalty:.4f}",
+            f"{r.share:.1%}" if r.penalty_weight > 0 else "",
+            _number(r.mean_abs_logit),
+        ]
+        for r in ends.itertuples()
+    ]
+    note = (
+        "Over the last tenth of the rounds, means over settings and seeds. Share: lambda times the "
+        "penalty, of the cross-entropy. Without a weight the penalty is only measured. A "
+        "discriminator that is always right leaves it nothing to change."
+    )
+    columns = [
+        "row",
+        "agent",
+        "seeds",
+        "accuracy",
+        "cross-entropy",
+        "penalty",
+        "share",
+        "mean |logit|",
+    ]
+    return Table("The discriminator at the end", note, columns, lines, heads=2)
 
 
 def _cell_table(cells: pd.DataFrame) -> Table:

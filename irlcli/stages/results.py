@@ -153,12 +153,19 @@ def run(job: Job) -> None:
             returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
             group = episodes.setdefault((cell.row, cell.measure), {})
             group[cell.agent, cell.seed] = returns["true_return"].to_numpy()
-    report = results.build(p, pd.DataFrame(points), episodes)
     learning = {
         role: pd.read_parquet(path)
         for role, path in job.inputs.items()
         if role.endswith("-learning")
     }
+    rewards = {
+        (row.name, method, seed): learning[role]
+        for row in p.rows
+        for method in p.methods
+        for seed in p.seeds
+        if (role := f"{row.name} {method} {seed} reward-learning") in learning
+    }
+    report = results.build(p, pd.DataFrame(points), episodes, rewards)
     report.cells.to_csv(job.output / f"{p.kind}.csv", **_CSV)
     report.points.to_csv(job.output / "seeds.csv", **_CSV)
     report.comparisons.to_csv(job.output / "comparisons.csv", **_CSV)
@@ -171,4 +178,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 4, run)
+STAGE = Stage("report", 5, run)

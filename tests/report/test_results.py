@@ -116,7 +116,7 @@ def cell(report, row, agent, measure):
 
 
 def test_a_complete_table_has_numbers_and_nothing_to_say():
-    report = results.build(*made(full()), {})
+    report = results.build(*made(full()), {}, {})
     found = cell(report, "lunar-lander bounce", "irm", "transfer")
     assert (found["mean"], found["seeds"], found["seeds_wanted"]) == (4.0, 3, 3)
     assert found["deviation"] == pytest.approx(7**0.5)
@@ -130,7 +130,7 @@ def test_a_complete_table_has_numbers_and_nothing_to_say():
 
 
 def test_experts_carried_over_are_one_number_and_no_sample():
-    report = results.build(*made(full()), {})
+    report = results.build(*made(full()), {}, {})
     row = "lunar-lander bounce"
     unseen, trained = (cell(report, row, "carried", m) for m in ("ood", "id"))
     assert (unseen["mean"], unseen["seeds"], unseen["seeds_wanted"]) == (110.0, 1, 1)
@@ -143,11 +143,11 @@ def test_experts_carried_over_are_one_number_and_no_sample():
     share = next(r for r in report.tables[2].rows if r[1] == "of the expert")
     assert share[report.tables[2].columns.index("experts, carried over")] == "100%"
     partly = full() | {(row, "carried", "id"): [200.0, None]}
-    assert cell(results.build(*made(partly), {}), row, "carried", "id")["of_expert"] is pd.NA
+    assert cell(results.build(*made(partly), {}, {}), row, "carried", "id")["of_expert"] is pd.NA
 
 
 def test_the_papers_numbers_stand_under_ours():
-    report = results.build(*made(full()), {})
+    report = results.build(*made(full()), {}, {})
     table = report.tables[0]
     ours, theirs = table.rows[:2]
     assert ours[:4] == ["lunar-lander bounce = 0.9", "return", "2.0 ± 1.0", "4.0 ± 2.6"]
@@ -169,7 +169,7 @@ def test_imitation_is_within_a_fifth_of_the_expert(student, expert, expected):
 
 
 def test_a_student_that_did_not_imitate_is_marked_everywhere():
-    report = results.build(*made(full(student=199.0)), {})
+    report = results.build(*made(full(student=199.0)), {}, {})
     assert not cell(report, "lunar-lander bounce", "erm", "id")["imitated"]
     assert cell(report, "lunar-lander bounce", "irm", "id")["imitated"]
     assert cell(report, "lunar-lander bounce", "erm", "id")["of_expert"] == pytest.approx(0.796)
@@ -182,11 +182,49 @@ def test_a_student_that_did_not_imitate_is_marked_everywhere():
     assert table.rows[0][2] == "199.0 ± 1.0 †"
 
 
+def recorded(accuracy, penalty, weight):
+    """Metrics of ten rounds in two settings; all but the last say nothing of the end."""
+    rounds = range(10)
+    return pd.DataFrame(
+        {
+            "round": k,
+            "setting": setting,
+            "accuracy": accuracy if k == 9 else 0.0,
+            "cross_entropy": (0.1 if setting == "a" else 0.3) if k == 9 else 9.0,
+            "penalty": penalty if k == 9 else 9.0,
+            "penalty_weight": weight if k == 9 else 0.0,
+            "mean_abs_logit": 50.0 if k == 9 else 0.0,
+        }
+        for k in rounds
+        for setting in "ab"
+    )
+
+
+def test_a_discriminator_that_leaves_the_penalty_nothing_is_told():
+    row, other = "lunar-lander bounce", "lunar-lander engine-power"
+    learning = {
+        (row, "irm", 0): recorded(0.94, 0.001, 4.0),
+        (row, "irm", 1): recorded(0.98, 0.003, 4.0),
+        (row, "erm", 0): recorded(0.99, 0.002, 0.0),
+        (other, "irm", 0): recorded(0.60, 0.5, 4.0),
+    }
+    report = results.build(*made(full()), {}, learning)
+    (note,) = report.notes
+    assert note.startswith("Saturated: lunar-lander bounce, AIRL-IRM: ")
+    assert "96.0% of the samples" in note and "4.0% of the cross-entropy" in note
+    (table,) = (t for t in report.tables if t.title == "The discriminator at the end")
+    assert table.rows == [
+        [row, "AIRL-ERM", "1", "99.0%", "0.200", "0.0020", "", "50.0"],
+        [row, "AIRL-IRM", "2", "96.0%", "0.200", "0.0020", "4.0%", "50.0"],
+        [other, "AIRL-IRM", "1", "60.0%", "0.200", "0.5000", "1000.0%", "50.0"],
+    ]
+
+
 def test_missing_seeds_are_counted_and_one_seed_has_no_p():
     values = full()
     values["lunar-lander bounce", "irm", "transfer"] = [5.0, None, None]
     values["lunar-lander engine-power", "irm", "transfer"] = [None] * 3
-    report = results.build(*made(values), {})
+    report = results.build(*made(values), {}, {})
     assert report.tables[0].rows[0][3] == "5.0 (1/3)"
     c = report.comparisons[report.comparisons["measure"] == "transfer"]
     assert c["p_welch"].isna().all() and c["p_welch_holm"].isna().all()
@@ -200,12 +238,12 @@ def test_missing_seeds_are_counted_and_one_seed_has_no_p():
 
 def test_runs_that_cannot_be_told_apart_are_named():
     same = {("irm", s): np.array([1.0, 2.0 + (s == 2)]) for s in range(3)}
-    report = results.build(*made(full()), {("lunar-lander bounce", "transfer"): same})
+    report = results.build(*made(full()), {("lunar-lander bounce", "transfer"): same}, {})
     (note,) = report.notes
     assert note.startswith("Identical: lunar-lander bounce, transfer: AIRL-IRM seed 0, AIRL-IRM")
     assert "seed 2" not in note
     methods = {("irm", 0): same["irm", 0], ("erm", 0): same["irm", 0]}
-    report = results.build(*made(full()), {("lunar-lander bounce", "id"): methods})
+    report = results.build(*made(full()), {("lunar-lander bounce", "id"): methods}, {})
     assert "AIRL-IRM seed 0, AIRL-ERM seed 0 have the same returns" in report.notes[0]
 
 
@@ -224,7 +262,7 @@ def test_other_commits_behind_a_cell_are_marked_also_far_behind_it():
     )
     runs = {**plan.runs, "parent": evaluation(1, inputs=("expert",)), "expert": old}
     runs[target.run] = evaluation(2, inputs=("parent",))
-    report = results.build(replace(plan, runs=runs), points, {})
+    report = results.build(replace(plan, runs=runs), points, {}, {})
     assert cell(report, "lunar-lander bounce", "irm", "transfer")["mixed"]
     assert not cell(report, "lunar-lander bounce", "erm", "transfer")["mixed"]
     assert report.tables[0].rows[0][3].endswith("‡")
@@ -236,13 +274,13 @@ def test_uncommitted_changes_count_as_another_code():
     plan, points = made(full())
     runs = dict(plan.runs)
     runs[plan.cells[0].run] = evaluation(0, dirty="abc")
-    notes = results.build(replace(plan, runs=runs), points, {}).notes
+    notes = results.build(replace(plan, runs=runs), points, {}, {}).notes
     assert len(notes) == 1 and "with changes abc" in notes[0]
 
 
 def test_runs_made_otherwise_are_counted_and_named():
     others = Others(stage="train-airl", about="x irm", why="seed 1 instead of 0", ids=("aa", "bb"))
-    (note,) = results.build(*made(full(), others=(others,)), {}).notes
+    (note,) = results.build(*made(full(), others=(others,)), {}, {}).notes
     assert note == "Left out: 2 runs of train-airl, x irm (aa, bb): seed 1 instead of 0."
 
 
@@ -280,7 +318,7 @@ def parsed(page):
 def test_the_page_is_whole_and_needs_nothing_else():
     plan, points = made(full(), others=())
     plan = replace(plan, title="<script>alert(1)</script> & co")
-    report = results.build(plan, points, {})
+    report = results.build(plan, points, {}, {})
     page = pages.html(plan, report, "<svg><g/></svg>", {"curves": "<svg></svg>"})
     tags = parsed(page)
     assert not [a for a in tags.attributes if a[0] == "script" or a[1] in ("src", "onload")]
@@ -312,20 +350,20 @@ def test_a_latex_table_longer_than_a_page_breaks():
 def test_what_nothing_stands_on_is_not_counted():
     plan, points = made(full())
     said = re.search(
-        r"on \d+ runs, \S+ in all", pages.markdown(plan, results.build(plan, points, {}))
+        r"on \d+ runs, \S+ in all", pages.markdown(plan, results.build(plan, points, {}, {}))
     )
     more = replace(plan, runs=plan.runs | {"e" * 16: evaluation(0)})
     again = re.search(
-        r"on \d+ runs, \S+ in all", pages.markdown(more, results.build(more, points, {}))
+        r"on \d+ runs, \S+ in all", pages.markdown(more, results.build(more, points, {}, {}))
     )
     assert said[0].startswith(f"on {len(plan.runs)} runs") and again[0] == said[0]
 
 
 def test_markdown_tables_are_rectangular():
     plan, points = made(full())
-    text = pages.markdown(plan, results.build(plan, points, {}))
+    text = pages.markdown(plan, results.build(plan, points, {}, {}))
     blocks = re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)
-    assert len(blocks) == len(results.build(plan, points, {}).tables)
+    assert len(blocks) == len(results.build(plan, points, {}, {}).tables)
     for block in blocks:
         assert len({line.count("|") for line in block.splitlines()}) == 1
 
