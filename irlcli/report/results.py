@@ -289,7 +289,7 @@ def _saturated(ends: pd.DataFrame) -> list[str]:
     return [
         f"Saturated: {r.row}, {TITLES[r.agent]}: at the end of training the discriminator is right "
         f"about {r.accuracy:.1%} of the samples and lambda times the penalty is {r.share:.1%} of "
-        "the cross-entropy: there is hardly a penalty to compare."
+        "the cross-entropy: there is little left for the penalty to change."
         for r in ends.itertuples()
         if r.penalty_weight > 0 and r.accuracy >= SATURATED
     ]

@@ -178,4 +178,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 5, run)
+STAGE = Stage("report", 6, run)
