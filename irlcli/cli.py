@@ -566,7 +566,19 @@ def _settings(env: str, config: Any, text: str, kind: str, origin: Any = None) -
 
     ``knob=3x,4x``; a knob alone stands for the values listed for it (``kind`` id or ood) in the
     settings file; ``3x,4x`` alone belongs to the knob that ``origin`` was trained with.
+
+    Raises:
+        UsageError: they name none, or one whose observations are not those of ``origin``.
     """
+    from irlcli.interventions import check_observed
+
+    found = _named_settings(env, config, text, kind, origin)
+    if origin is not None:
+        check_observed(env, origin.settings, found)
+    return found
+
+
+def _named_settings(env, config, text, kind, origin):
     from irlcli.interventions import environment, knob_of, parse_settings
 
     if "=" in text:

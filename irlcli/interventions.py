@@ -10,6 +10,7 @@ Grammar, per comma-separated value: ``2x`` multiplies the default, ``0.5`` is ab
 
 import math
 import re
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 from irlcli.errors import UsageError, suggest
@@ -60,7 +61,8 @@ class Knob(NamedTuple):
     """One mechanism of an environment that can be intervened on.
 
     ``low`` and ``high`` bound every number of a value (inclusive); ``kinds`` are the forms
-    it accepts, the first being the usual one. ``whole`` admits whole numbers only.
+    it accepts, the first being the usual one. ``whole`` admits whole numbers only. ``observed``:
+    what is set becomes part of the observation.
     """
 
     argument: str
@@ -69,6 +71,7 @@ class Knob(NamedTuple):
     high: float
     what: str
     whole: bool = False
+    observed: bool = False
 
 
 class Environment(NamedTuple):
@@ -89,9 +92,21 @@ class Environment(NamedTuple):
 _FRICTION = "tangential, torsional and rolling friction of the robot's links"
 _WALKER_KNOBS = {
     "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "mass of every link"),
-    "goal-y": Knob("goal_y", ("absolute",), -10000.0, 10000.0, "the goal is at (1000, goal-y) m"),
+    "goal-y": Knob(
+        "goal_y",
+        ("absolute",),
+        -10000.0,
+        10000.0,
+        "the goal is at (1000, goal-y) m",
+        observed=True,
+    ),
     "direction": Knob(
-        "direction", ("absolute", "range"), -180.0, 180.0, "of the goal, degrees from ahead"
+        "direction",
+        ("absolute", "range"),
+        -180.0,
+        180.0,
+        "of the goal, degrees from ahead",
+        observed=True,
     ),
 }
 
@@ -195,6 +210,29 @@ def check_tabular(env: str, stage: str, wanted: bool) -> None:
         f"{stage} takes {fit}; rewards of {env} come from "
         f"`irl {'train-airl' if wanted else 'train-maxent'}`",
     )
+
+
+def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) -> None:
+    """Refuse settings whose observations are not those of the settings ``trained`` in.
+
+    Raises:
+        UsageError: the goal is observed in the ones and not in the others.
+    """
+    known = environment(env).knobs
+
+    def observed(setting: Setting) -> bool:
+        return setting.knob is not None and known[setting.knob].observed
+
+    learned = any(observed(parse_setting(env, text)) for text in trained)
+    for setting in wanted:
+        if observed(setting) != learned:
+            goals = ", ".join(name for name, knob in known.items() if knob.observed)
+            others = ", ".join(name for name, knob in known.items() if not knob.observed)
+            raise UsageError(
+                f"{env} {setting} has other observations than {', '.join(trained)}: a goal is part "
+                "of them",
+                f"name a setting of {goals if learned else others}",
+            )
 
 
 def knob_of(env: str, knob: str) -> Knob:

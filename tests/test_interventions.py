@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from irlcli.envs import make
 from irlcli.errors import IrlError, UsageError
 from irlcli.interventions import (
     ENVIRONMENTS,
@@ -15,6 +16,7 @@ from irlcli.interventions import (
     Knob,
     Setting,
     Value,
+    check_observed,
     env_kwargs,
     environment,
     knob_of,
@@ -295,3 +297,43 @@ def test_any_environment_and_text(env, text):
         with pytest.raises(UsageError) as caught:
             ask(env, text)
         assert caught.value.hint
+
+
+def test_what_a_knob_says_of_observations_is_so():
+    for env in ("ant", "half-cheetah"):
+        known = ENVIRONMENTS[env].knobs
+        sizes = {}
+        for name, knob in known.items():
+            value = {"triple": "1:1:1", "multiplier": "1x"}.get(knob.kinds[0], "1")
+            made = make(env, parse_setting(env, f"{name}={value}"))
+            sizes.setdefault(knob.observed, set()).add(made.observation_space.shape)
+            made.close()
+        made = make(env, parse_setting(env, "default"))
+        sizes[False].add(made.observation_space.shape)
+        made.close()
+        assert [len(sizes[observed]) for observed in (False, True)] == [1, 1]
+        assert sizes[False] != sizes[True]
+
+
+@pytest.mark.parametrize(
+    ("trained", "wanted", "fits"),
+    [
+        ("goal-y=0", "goal-y=900", True),
+        ("goal-y=0", "direction=10", True),
+        ("mass=2x", "leg-length=3x", True),
+        ("mass=2x", "default", True),
+        ("goal-y=0", "default", False),
+        ("goal-y=0", "mass=2x", False),
+        ("default", "direction=10", False),
+    ],
+)
+def test_a_goal_that_the_policy_cannot_see_is_refused(trained, wanted, fits):
+    places = [parse_setting("ant", wanted)]
+    if fits:
+        check_observed("ant", [trained], places)
+        return
+    with pytest.raises(UsageError, match="other observations") as caught:
+        check_observed("ant", [trained], places)
+    goals = trained == "goal-y=0"
+    assert ("goal-y, direction" in caught.value.hint) == goals
+    assert ("mass, friction, leg-length" in caught.value.hint) != goals

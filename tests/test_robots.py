@@ -269,8 +269,16 @@ def test_walkers_go_through_the_chain(tmp_path, irl, env, intervention, ood):
     if env == "ant":
         assert done.code == 0, done.err
     else:
-        assert done.code == 2
-        assert "the reward takes observations of size 19" in done.err and "hint:" in done.err
+        refused = [done]
+        refused.append(irl("evaluate", "--policy", "moved", "--ood", "mass=2x", *common[:-1]))
+        refused.append(
+            irl("play", "moved", "--ood", "mass=2x", "--store", tmp_path, "--out", "x.gif")
+        )
+        for done in refused:
+            assert done.code == 2
+            assert "half-cheetah mass=2x has other observations than goal-y=" in done.err
+            assert "hint: name a setting of goal-y, direction" in done.err
+            assert "RUN" not in done.err
 
 
 def test_play_draws_the_settings_side_by_side(chains, irl, tmp_path):
