@@ -198,8 +198,18 @@ def _draw_experts(axis, maze: Maze) -> None:
             axis.plot(
                 path % size + jitter[0], path // size + jitter[1], color=colour, lw=0.8, alpha=0.5
             )
-        axis.plot([], [], color=colour, lw=2, label=f"{setting}: {len(paths)}")
-    axis.legend(loc="lower right", fontsize=7.5, framealpha=0.9)
+        axis.plot([], [], color=colour, lw=2, label=f"{setting.partition('=')[2]}: {len(paths)}")
+    # Below the maze: its every corner is gate or path.
+    axis.legend(
+        title=f"{setting.partition('=')[0]}: episodes",
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        ncols=len(maze.paths),
+        frameon=False,
+        fontsize=8,
+        title_fontsize=8,
+        handlelength=1.2,
+    )
     _ends(axis, size, "black")
     _frame(axis, size)
     axis.set_title(

@@ -97,4 +97,4 @@ def run(job: Job) -> None:
     (job.output / "figure2.md").write_text(text)
 
 
-STAGE = Stage("figure2", 1, run)
+STAGE = Stage("figure2", 2, run)
