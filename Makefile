@@ -22,7 +22,7 @@ VENV    ?= .venv
 STORE   ?= runs
 PROFILE ?= standard
 SEEDS   ?= 0 1 2 3 4
-METHODS ?= erm irm erm-balanced irm-shuffled
+METHODS ?= $(KNOWN)
 RUN     ?=
 
 IRL     := $(VENV)/bin/irl
@@ -36,6 +36,14 @@ $(error SET and CHOOSE make other runs: say what to call them, e.g. TAG=mine)
 endif
 endif
 TAG ?= $(PROFILE)
+
+KNOWN   := erm irm erm-balanced irm-shuffled
+ifneq ($(filter-out $(KNOWN),$(METHODS)),)
+$(error METHODS="$(METHODS)": write some of $(KNOWN), with spaces between them)
+endif
+ifneq ($(shell printf '%s' '$(SEEDS)' | tr -d '0-9 '),)
+$(error SEEDS="$(SEEDS)": write numbers with spaces between them, SEEDS="0 1 2")
+endif
 
 .DELETE_ON_ERROR:
 .PHONY: demo test bench torture all-results experts table1 table1-lunar-lander table2 figure2 figure3 figure4 clean FORCE
@@ -73,6 +81,10 @@ demo: $(READY)
 	    $(DEMO_ROW).returns
 	@echo
 	@$(IRL) report returns --store $(STORE) $(call RETURNS,demo.$(DEMO_ROW),erm irm,0)
+	@echo
+	@echo "what it earns to learn no reward (irl evaluate --expert --trained-in engine-power ...):"
+	@$(IRL) evaluate --expert --trained-in engine-power --env lunar-lander --ood engine-power \
+	    --store $(STORE) $(DEMO_SETTINGS) 2>&1 > /dev/null | grep -v ^HIT
 	@echo
 	@echo "lineage of the IRM transfer policy (irl lineage demo.$(DEMO_ROW).irm.0.transfer):"
 	@$(IRL) lineage --store $(STORE) demo.$(DEMO_ROW).irm.0.transfer

@@ -499,11 +499,13 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
         settings = _settings(origin.env, config, intervention if ood is None else ood, kind, origin)
     else:
         settings = [parse_setting(origin.env, s) for s in origin.settings]
-    request = evaluate.request(origin.env, settings, config.evaluation, source, seed=seed)
+    who = _joined([origin.agent, origin.method, f"of seed {origin.seed}"])
+    request = evaluate.request(origin.env, settings, config.evaluation, source, seed=seed, who=who)
     return session.deliver([request], name)
 
 
 def _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, name):
+    from irlcli.interventions import check_observed
     from irlcli.stages import From, evaluate, train_expert
 
     ood, intervention = places
@@ -523,6 +525,8 @@ def _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, nam
         wanted = [(setting, [setting]) for setting in settings]
     else:
         wanted = [(own, settings) for own in _settings(env, config, trained_in, "id")]
+        for own, measured in wanted:
+            check_observed(env, [str(own)], measured)
     if name is not None and len(wanted) > 1:
         raise UsageError(
             f"--name {name!r} cannot stand for {len(wanted)} evaluations",
@@ -535,6 +539,7 @@ def _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, nam
             config.evaluation,
             From(train_expert.request(env, own, 0, config.expert_of(own)), "policy.pt"),
             seed=seed,
+            who=f"expert of {own}",
         )
         for own, measured in wanted
     ]
@@ -719,6 +724,7 @@ def _method(learner: dict[str, Any]) -> list[Any]:
     select = learner.get("select", "last")
     return [
         method,
+        learner.get("penalty") if method in PENALISED else None,
         f"lambda {_number(weight)}" if method in PENALISED else None,
         f"selecting by {select}" if select != "last" else None,
     ]
@@ -737,7 +743,8 @@ def _origin(record: Any, makers: dict[str, Any]) -> str:
     for role in ("policy", "reward"):
         maker = makers.get(record.inputs.get(role))
         if maker is not None:
-            parts.append(_joined(["of", maker.stage, *_learned(maker.parameters)]))
+            expert_of = maker.parameters.get("setting") if maker.stage == "train-expert" else None
+            parts.append(_joined(["of", maker.stage, expert_of, *_learned(maker.parameters)]))
             record = maker
     return "".join(f" {part}" for part in parts)
 
@@ -812,11 +819,8 @@ def verify(
     quick: Annotated[bool, typer.Option("--quick", help="Compare sizes, hash nothing.")] = False,
 ) -> None:
     """Check stored bytes against their digests; damaged artefacts go to quarantine."""
-    names: dict[str, str] = {}
     if ref is None:
         _check_there(session)
-        # First the names: what is named is there before its name.
-        names = session.store.names()
         ids = session.store.ids()
     else:
         ids = [_artefact(session, ref).id]
@@ -826,13 +830,9 @@ def verify(
     for id16 in newer:
         session.console.warn(f"not checked: {found[id16].problems[0]}")
     checked = len(ids) - len(newer)
-    dangling = {name: id16 for name, id16 in names.items() if id16 not in ids}
-    for name, id16 in dangling.items():
-        session.console.warn(f"the name {name!r} points to {id16}, which is not there")
     result = {
         "checked": checked,
         "newer": newer,
-        "dangling": dangling,
         "damaged": {
             id16: {
                 "problems": damage.problems,
@@ -856,10 +856,29 @@ def verify(
         )
         error.details = result
         raise error
+    store = session.store
+    missing = store.missing(store.index(name_newer=False)) if ref is None else {}
+    if missing:
+        for id16, by in missing.items():
+            print(f"{id16} is gone, and needed by {', '.join(by)}", file=sys.stderr)
+        error = IntegrityError(
+            f"{_artefacts(len(missing))} missing: {', '.join(missing)}",
+            "run again what made it (under the same --name), or `irl name` another",
+        )
+        error.details = result | {"missing": missing}
+        raise error
     if session.as_json:
         out.print_json("verify", result)
     else:
-        out.print_data(f"{checked} artefacts verified")
+        out.print_data(f"{_artefacts(checked)} verified")
+
+
+def _artefacts(count: int) -> str:
+    return "1 artefact" if count == 1 else f"{count} artefacts"
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
 
 
 @command("gc", runs=False, reads=False)
@@ -889,7 +908,9 @@ def gc(
     for path in work:
         out.print_data(f"{path.name[:16]}  scratch of an interrupted run")
     verb = "removed" if delete else "would be removed (add --delete)"
-    print(f"{len(artefacts)} artefacts, {size:,} bytes {verb}", file=sys.stderr)
+    found = f"{_artefacts(len(artefacts))}, {size:,} bytes"
+    found += f" and scratch of {_runs(len(work))}" if work else ""
+    print(f"{found} {verb}", file=sys.stderr)
 
 
 @command("name", runs=False)

@@ -66,6 +66,20 @@ class Step(NamedTuple):
     artefact: Artefact | None = None
 
 
+@contextmanager
+def _file_errors_of(label: str) -> Iterator[None]:
+    """A full disk or a file that cannot be written, as the failure of the stage ``label``."""
+    try:
+        yield
+    except OSError as error:
+        raise StageFailed(
+            f"{label}: {error.strerror or error}"
+            + (f": {error.filename}" if error.filename else ""),
+            "nothing was published: mend the cause and run the same command again; it goes on from "
+            "the last checkpoint, if there is one",
+        ) from error
+
+
 class Runner:
     """Turns requests into artefacts of one store.
 
@@ -141,18 +155,11 @@ class Runner:
             Busy: another process works on it, or collects, and this runner does not wait.
             Interrupted: a signal asked to stop; the checkpoint has been saved.
         """
-        try:
+        with _file_errors_of(request.label):
             self.store.create()
             # From the first artefact that is found to the last one that is made of it.
             with self.store.in_use(self.wait, partial(self.console.wait, "the store")):
                 return self._run(request)
-        except OSError as error:
-            raise StageFailed(
-                f"{request.label}: {error.strerror or error}"
-                + (f": {error.filename}" if error.filename else ""),
-                "nothing was published and the checkpoint is kept: mend the cause and run "
-                "the same command again",
-            ) from error
 
     def _run(self, request: Request) -> Artefact:
         sources: dict[str, Source] = {}
@@ -163,7 +170,8 @@ class Runner:
         record = self._record(request, {role: s.sha256 for role, s in sources.items()})
         artefact = self.store.find(record.key)
         if artefact is None:
-            artefact = self._make(request, record, sources)
+            with _file_errors_of(request.label):
+                artefact = self._make(request, record, sources)
         else:
             self.console.finish(artefact, hit=True)
         return artefact

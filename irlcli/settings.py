@@ -15,7 +15,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from irlcli.errors import UsageError, suggest
-from irlcli.interventions import Setting, environment, parse_settings
+from irlcli.interventions import Setting, environment, knob_of, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
 
@@ -347,6 +347,8 @@ def _nest(path: Sequence[str], value: Any) -> dict[str, Any]:
 
 def _convert(env: str, tree: Mapping[str, Any]) -> Settings:
     _check_names(tree, Settings, ())
+    for knob in tree.get("interventions", {}):
+        knob_of(env, knob)
     try:
         settings = msgspec.convert(tree, Settings)
     except msgspec.ValidationError as error:
@@ -357,8 +359,15 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Settings:
             field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
         raise UsageError(f"{field}: {message}", _field_hint(field)) from None
     for knob, values in settings.interventions.items():
-        for value in (*values.id, *values.ood):
-            parse_settings(env, f"{knob}={value}")
+        trained, unseen = (
+            {setting for value in part for setting in parse_settings(env, f"{knob}={value}")}
+            for part in (values.id, values.ood)
+        )
+        if both := sorted(str(setting) for setting in trained & unseen):
+            raise UsageError(
+                f"interventions.{knob}: {', '.join(both)} is both trained in (id) and held out (ood)",
+                "hold out what nothing is trained in",
+            )
     return settings
 
 

@@ -138,8 +138,12 @@ def publish_files(
     stage: str = "train-airl",
     parameters: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
+    places: Mapping[str, str] | None = None,
 ) -> Published:
-    """Publish ``files`` as a stage would, without the cost of running one."""
+    """Publish ``files`` as a stage would, without the cost of running one.
+
+    ``inputs`` are contents by role, ``places`` says where they were read.
+    """
     record = KeyRecord(stage, 1, dict(parameters or {"seed": 0}), dict(inputs or {}))
     store.create()
     with store.in_use(), store.working_on(record.key, wait=False) as scratch:
@@ -147,7 +151,8 @@ def publish_files(
         for name, data in files.items():
             (output / name).parent.mkdir(parents=True, exist_ok=True)
             (output / name).write_bytes(data)
-        return store.publish(record, output, {"command": ["irl", stage]})
+        origin = {"command": ["irl", stage], "inputs": dict(places or {})}
+        return store.publish(record, output, origin)
 
 
 @pytest.fixture

@@ -291,7 +291,9 @@ def test_files_that_cannot_be_read(tmp_path):
             "'interventions.bounce.idd'",
             "did you mean 'id'",
         ),
-        ("[interventions.mine]\nid = ['0.1']", "interventions.mine", ""),
+        ("[interventions.mine]\nid = ['0.1']", "no intervention 'mine'", "bounce"),
+        ("[interventions.bounc]\nid = ['0.1']", "no intervention 'bounc'", "did you mean 'bounce'"),
+        ("[interventions.bounce]\nid = ['0.1', '0.90']\nood = ['0.9']", "bounce=0.9", "hold out"),
         (
             "[interventions.bounce.expert_ppo]\nn_epoch = 3",
             "expert_ppo.n_epoch'",

@@ -31,9 +31,11 @@ def request(
     policy: Source | From | None = None,
     agent: Agent = "policy",
     seed: int = 0,
+    who: str = "",
 ) -> Request:
     """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``settings_``.
 
+    ``who`` says in the label whose policy it is.
     Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
 
     Raises:
@@ -55,7 +57,7 @@ def request(
         evaluation=evaluation,
     )
     inputs = {} if policy is None else {"policy": policy}
-    label = f"evaluate {agent} {env} {', '.join(texts)} seed {seed}"
+    label = f"evaluate {who or agent} in {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, inputs, label)
 
 

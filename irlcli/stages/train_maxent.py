@@ -41,7 +41,8 @@ def request(
     parameters = Parameters(
         env=env, settings=texts, unseen=tuple(str(s) for s in unseen), seed=seed, maxent=maxent
     )
-    label = f"train-maxent {maxent.method} {env} {', '.join(texts)} seed {seed}"
+    kind = f" {maxent.penalty} lambda {maxent.penalty_weight:g}" if maxent.method == "irm" else ""
+    label = f"train-maxent {maxent.method}{kind} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, {"demonstrations": demos}, label)
 
 

@@ -294,10 +294,11 @@ class Store:
         """The artefacts of :meth:`index`."""
         yield from self.index().artefacts.values()
 
-    def index(self) -> Index:
+    def index(self, name_newer: bool = True) -> Index:
         """All artefacts as they are now, each manifest read once.
 
-        Those of a newer schema are named in a warning; those removed meanwhile are left out.
+        With ``name_newer`` those of a newer schema are named in a warning; those removed
+        meanwhile are left out.
 
         Raises:
             IntegrityError: as :meth:`get`.
@@ -310,7 +311,8 @@ class Store:
                 continue
             except NewerFormat as error:
                 newer[name] = (self.root / name / MANIFEST).read_bytes()
-                self._warn(f"{error.message}: left out; {error.hint}")
+                if name_newer:
+                    self._warn(f"{error.message}: left out; {error.hint}")
         return Index(artefacts, newer)
 
     def names(self) -> dict[str, str]:
@@ -667,6 +669,8 @@ class Store:
         What a newer version made is never among them, nor what its manifest mentions.
         """
         index = self.index()
+        for id16, by in self.missing(index).items():
+            self._warn(f"{id16} is gone, and needed by {', '.join(by)}: no history of it is kept")
         kept = index.reached_from(self.names().values())
         limit = time.time() - grace_seconds
         return [
@@ -674,6 +678,29 @@ class Store:
             for id16, artefact in index.artefacts.items()
             if id16 not in kept and _older(artefact.directory, limit)
         ]
+
+    def missing(self, index: Index) -> dict[str, list[str]]:
+        """Artefacts that a name or the history of a named one leads to, and that are gone.
+
+        By id: what needs them. ``gc`` never takes such an artefact away. An input that was a file
+        outside the store is not looked for. ``index`` is of now or of some time ago: what was made
+        since is not missed.
+        """
+        names = self.names()
+        there = index.artefacts.keys() | index.newer.keys()
+        found: dict[str, list[str]] = {}
+        for name, id16 in names.items():
+            if id16 not in there and not (self.root / id16).is_dir():
+                found.setdefault(id16, []).append(f"the name {name!r}")
+        for id16 in sorted(index.reached_from(names.values())):
+            artefact = index.artefacts[id16]
+            lost = [role for role, held in index.parents(artefact).items() if not held]
+            places = artefact.provenance().get("inputs") or {} if lost else {}
+            for role in lost:
+                source, _, rest = str(places.get(role, "")).partition("/")
+                if rest and re.fullmatch(_ID, source) and source not in there:
+                    found.setdefault(source, []).append(id16)
+        return found
 
     def stale_work(self, grace_seconds: float) -> list[Path]:
         """Scratch directories that nobody holds and nobody touched within the grace period."""

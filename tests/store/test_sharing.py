@@ -87,16 +87,41 @@ def test_verify_says_in_json_what_is_damaged(irl, empty_store, publish):
     assert Path(damage["quarantine"], "reward.pt").exists()
 
 
-def test_verify_says_which_names_point_to_nothing(irl, empty_store, publish):
-    kept, removed = (publish(empty_store, parameters={"seed": seed}).artefact for seed in (0, 1))
-    empty_store.set_name("kept", kept)
-    empty_store.set_name("removed", removed)
-    assert "points to" not in irl("verify", "--store", empty_store.root).err
-    shutil.rmtree(removed.directory)
+def test_verify_says_what_is_missing(irl, empty_store, publish):
+    """What a name points to, and what something named was made from; nothing else."""
+    chain = []
+    for name in ("expert", "demos", "reward"):
+        inputs, places = {}, {}
+        if chain:
+            output = chain[-1].manifest.outputs[0]
+            inputs = {"input": output.sha256}
+            places = {"input": f"{chain[-1].id}/{output.path}"}
+        files, parameters = {name: name.encode()}, {"of": name}
+        made = publish(empty_store, files, parameters=parameters, inputs=inputs, places=places)
+        chain.append(made.artefact)
+    expert, demos, reward = chain
+    foreign = {"inputs": {"input": "0" * 64}, "places": {"input": "elsewhere/reward.pt"}}
+    other = publish(empty_store, parameters={"of": "a file"}, **foreign).artefact
+    for name, artefact in (("kept", reward), ("other", other), ("demos", demos)):
+        empty_store.set_name(name, artefact)
+    sound = irl("verify", "--store", empty_store.root)
+    assert (sound.code, sound.out, sound.err) == (0, "4 artefacts verified\n", "")
+    shutil.rmtree(demos.directory)
     result = irl("verify", "--json", "--store", empty_store.root)
-    assert (result.code, json.loads(result.out)["dangling"]) == (0, {"removed": removed.id})
-    assert f"the name 'removed' points to {removed.id}, which is not there" in result.err
-    assert "'kept'" not in result.err
+    said = json.loads(result.out)
+    assert (result.code, said["exit_code"], said["checked"]) == (4, 4, 3)
+    assert said["missing"] == {demos.id: ["the name 'demos'", reward.id]}
+    result = irl("verify", "--store", empty_store.root)
+    lines = result.err.splitlines()
+    assert lines[0] == f"{demos.id} is gone, and needed by the name 'demos', {reward.id}"
+    assert lines[1] == f"error: 1 artefact missing: {demos.id}"
+    collected = irl("gc", "--grace-days", "0", "--store", empty_store.root)
+    assert collected.out.startswith(expert.id)
+    assert f"{lines[0]}: no history of it is kept" in collected.err
+    # What no name needs may go.
+    for name in ("kept", "demos"):
+        (empty_store.root / ".names" / name).unlink()
+    assert irl("verify", "--store", empty_store.root).code == 0
 
 
 def manifests_read(monkeypatch) -> list[str]:
