@@ -84,7 +84,7 @@ demo: $(READY)
 	@echo
 	@echo "what it earns to learn no reward (irl evaluate --expert --trained-in engine-power ...):"
 	@$(IRL) evaluate --expert --trained-in engine-power --env lunar-lander --ood engine-power \
-	    --store $(STORE) $(DEMO_SETTINGS) 2>&1 > /dev/null | grep -v ^HIT
+	    --store $(STORE) $(DEMO_SETTINGS) --quiet > /dev/null
 	@echo
 	@echo "lineage of the IRM transfer policy (irl lineage demo.$(DEMO_ROW).irm.0.transfer):"
 	@$(IRL) lineage --store $(STORE) demo.$(DEMO_ROW).irm.0.transfer

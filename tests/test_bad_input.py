@@ -803,6 +803,19 @@ def test_full_or_read_only_disk(irl, store_copy, monkeypatch, call, number):
     assert len(Store(store_copy.path).ids()) == len(before) + 1
 
 
+def test_a_full_disk_is_the_failure_of_the_stage_that_met_it(irl, tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    Store(tmp_path / "runs").create()
+    monkeypatch.setattr(os, "fsync", refuse)
+    line = f"evaluate --expert {LANDER} --set expert.total_steps=64 --profile smoke"
+    result = irl(*arguments(line, tmp_path / "runs"))
+    stage = "train-expert lunar-lander engine-power=1x seed 0"
+    assert_answered(result, 1, f"error: {stage}: {os.strerror(errno.ENOSPC)}")
+    assert "if there is one" in result.err
+
+
 # Through a real process
 
 IRL = [sys.executable, "-m", "irlcli"]

@@ -726,6 +726,23 @@ def test_the_label_of_a_transfer_says_how_the_reward_was_learned(irl, store_copy
     assert irl(*line, *SMOKE, "--dry-run", "--store", store_copy.path).out == plan
 
 
+def test_labels_tell_apart_whose_policy_and_which_penalty(irl, store_copy, tmp_path):
+    place = ["--dry-run", "--store", store_copy.path]
+    line = [
+        "evaluate",
+        "--expert",
+        "--trained-in",
+        "engine-power=1x,1.25x",
+        "--env",
+        "lunar-lander",
+    ]
+    plan = irl(*line, "--ood", "engine-power=1.5x", *SMOKE, *place).out
+    for own in ("1x", "1.25x"):
+        assert f"evaluate expert of engine-power={own} in lunar-lander engine-power=1.5x" in plan
+    plan = irl("evaluate", "--policy", "airl", "--ood", "1.5x", *SMOKE, *place).out
+    assert "evaluate student irm of seed 0 in lunar-lander engine-power=1.5x seed 0" in plan
+
+
 def test_version(irl):
     from importlib.metadata import version
 
