@@ -22,7 +22,7 @@ VENV    ?= .venv
 STORE   ?= runs
 PROFILE ?= standard
 SEEDS   ?= 0 1 2 3 4
-METHODS ?= $(KNOWN)
+METHODS ?= erm irm erm-balanced irm-shuffled
 RUN     ?=
 
 IRL     := $(VENV)/bin/irl
@@ -38,11 +38,21 @@ endif
 TAG ?= $(PROFILE)
 
 KNOWN   := erm irm erm-balanced irm-shuffled
-ifneq ($(filter-out $(KNOWN),$(METHODS)),)
-$(error METHODS="$(METHODS)": write some of $(KNOWN), with spaces between them)
+METHODS := $(strip $(METHODS))
+SEEDS   := $(strip $(SEEDS))
+ifneq ($(words $(METHODS)),$(words $(sort $(filter $(KNOWN),$(METHODS)))))
+$(error METHODS="$(METHODS)": write some of $(KNOWN), each once, with spaces between them)
 endif
-ifneq ($(shell printf '%s' '$(SEEDS)' | tr -d '0-9 '),)
+DIGITS  := 0 1 2 3 4 5 6 7 8 9
+without  = $(if $(2),$(call without,$(subst $(firstword $(2)),,$(1)),$(wordlist 2,10,$(2))),$(1))
+ifneq ($(strip $(call without,$(SEEDS),$(DIGITS))),)
 $(error SEEDS="$(SEEDS)": write numbers with spaces between them, SEEDS="0 1 2")
+endif
+ifneq ($(words $(SEEDS)),$(words $(sort $(SEEDS))))
+$(error SEEDS="$(SEEDS)": write each seed once, with spaces between them)
+endif
+ifeq ($(and $(METHODS),$(SEEDS)),)
+$(error METHODS="$(METHODS)" SEEDS="$(SEEDS)": write at least one of each, with spaces between them)
 endif
 
 .DELETE_ON_ERROR:

@@ -499,7 +499,9 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
         settings = _settings(origin.env, config, intervention if ood is None else ood, kind, origin)
     else:
         settings = [parse_setting(origin.env, s) for s in origin.settings]
-    who = _joined([origin.agent, origin.method, f"of seed {origin.seed}"])
+    who = f"expert of {', '.join(origin.settings)}"
+    if origin.agent != "expert":
+        who = _joined([origin.agent, origin.method, f"of seed {origin.seed}"])
     request = evaluate.request(origin.env, settings, config.evaluation, source, seed=seed, who=who)
     return session.deliver([request], name)
 
@@ -856,21 +858,38 @@ def verify(
         )
         error.details = result
         raise error
-    store = session.store
-    missing = store.missing(store.index(name_newer=False)) if ref is None else {}
-    if missing:
-        for id16, by in missing.items():
-            print(f"{id16} is gone, and needed by {', '.join(by)}", file=sys.stderr)
-        error = IntegrityError(
-            f"{_artefacts(len(missing))} missing: {', '.join(missing)}",
-            "run again what made it (under the same --name), or `irl name` another",
-        )
-        error.details = result | {"missing": missing}
-        raise error
+    if ref is None:
+        _check_missing(session, result)
     if session.as_json:
         out.print_json("verify", result)
     else:
         out.print_data(f"{_artefacts(checked)} verified")
+
+
+def _check_missing(session: Session, result: dict[str, Any]) -> None:
+    """Fail if a name points to nothing; warn where only the history of something named is gone."""
+    missing = session.store.missing(session.store.index(name_newer=False))
+    result["missing"] = {
+        id16: {"names": lost.names, "made": lost.made, "command": lost.command or None}
+        for id16, lost in missing.items()
+    }
+    for id16, lost in missing.items():
+        if lost.names:
+            print(lost.text(id16), file=sys.stderr)
+            if lost.command:
+                print(f"{id16}: was made by: {lost.command}", file=sys.stderr)
+        else:
+            session.console.warn(lost.text(id16))
+    names = sorted(name for lost in missing.values() for name in lost.names)
+    if names:
+        error = IntegrityError(
+            f"{len(names)} of {len(session.store.names())} names point to nothing: "
+            f"{', '.join(names)}",
+            "run again what made it under the same --name, or give the name to another artefact "
+            "(irl name REF NAME)",
+        )
+        error.details = result
+        raise error
 
 
 def _artefacts(count: int) -> str:

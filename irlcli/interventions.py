@@ -311,7 +311,7 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
     settings = tuple(Setting(knob, parse_value(env, knob, part)) for part in values.split(","))
     for i, setting in enumerate(settings):
         for other in settings[:i]:
-            if _world(setting) == _world(other):
+            if world(setting) == world(other):
                 again = f", once as {setting}" if setting != other else ""
                 raise UsageError(
                     f"{text!r} names {other} twice{again}",
@@ -320,7 +320,7 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
     return settings
 
 
-def _world(setting: Setting) -> tuple[float, ...]:
+def world(setting: Setting) -> tuple[float, ...]:
     """Equal for values of a knob that make one world, however written: 10 and 10..10."""
     kind, numbers = setting.value or ("absolute", ())
     return numbers[:1] if kind == "range" and numbers[0] == numbers[1] else numbers

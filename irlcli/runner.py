@@ -337,5 +337,5 @@ def _source(artefact: Artefact, output: str | None) -> Source:
 def _address(source: Source) -> str:
     """Where an input was when it was read: inside the store, or a foreign path."""
     if source.artefact is None:
-        return str(source.path)
+        return str(source.path.absolute())
     return f"{source.artefact.id}/{source.path.relative_to(source.artefact.directory)}"

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from irlcli.errors import UsageError, suggest
-from irlcli.interventions import Setting, environment, knob_of, parse_settings
+from irlcli.interventions import Setting, environment, knob_of, parse_settings, world
 
 PROFILES = ("smoke", "standard", "paper")
 
@@ -360,10 +360,11 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Settings:
         raise UsageError(f"{field}: {message}", _field_hint(field)) from None
     for knob, values in settings.interventions.items():
         trained, unseen = (
-            {setting for value in part for setting in parse_settings(env, f"{knob}={value}")}
+            [setting for value in part for setting in parse_settings(env, f"{knob}={value}")]
             for part in (values.id, values.ood)
         )
-        if both := sorted(str(setting) for setting in trained & unseen):
+        worlds = {world(setting) for setting in trained}
+        if both := [str(setting) for setting in unseen if world(setting) in worlds]:
             raise UsageError(
                 f"interventions.{knob}: {', '.join(both)} is both trained in (id) and held out (ood)",
                 "hold out what nothing is trained in",

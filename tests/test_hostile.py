@@ -741,6 +741,12 @@ def test_labels_tell_apart_whose_policy_and_which_penalty(irl, store_copy, tmp_p
         assert f"evaluate expert of engine-power={own} in lunar-lander engine-power=1.5x" in plan
     plan = irl("evaluate", "--policy", "airl", "--ood", "1.5x", *SMOKE, *place).out
     assert "evaluate student irm of seed 0 in lunar-lander engine-power=1.5x seed 0" in plan
+    store = Store(store_copy.path)
+    makers = (a for a in store.artefacts() if a.manifest.record.stage == "train-expert")
+    for expert in makers:
+        own = expert.manifest.record.parameters["setting"]
+        plan = irl("evaluate", "--policy", expert.id, "--ood", "1.5x", *SMOKE, *place).out
+        assert f"evaluate expert of {own} in lunar-lander engine-power=1.5x seed 0" in plan
 
 
 def test_version(irl):

@@ -295,6 +295,11 @@ def test_files_that_cannot_be_read(tmp_path):
         ("[interventions.bounc]\nid = ['0.1']", "no intervention 'bounc'", "did you mean 'bounce'"),
         ("[interventions.bounce]\nid = ['0.1', '0.90']\nood = ['0.9']", "bounce=0.9", "hold out"),
         (
+            "[interventions.engine-power]\nid = ['1x']\nood = ['1.0x']",
+            "engine-power=1x is both",
+            "hold out",
+        ),
+        (
             "[interventions.bounce.expert_ppo]\nn_epoch = 3",
             "expert_ppo.n_epoch'",
             "did you mean 'n_epochs'",

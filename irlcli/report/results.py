@@ -225,18 +225,22 @@ def _comparisons(plan: Plan, points: pd.DataFrame, cells: pd.DataFrame) -> pd.Da
 def _ends(plan: Plan, learning: Learning) -> pd.DataFrame:
     """A row per row and method: the discriminator over the last tenth of the rounds.
 
-    Means over settings and seeds; ``share`` is lambda times the penalty over the cross-entropy.
+    Means over settings and seeds; ``share`` is that of lambda times the penalty over that of the
+    cross-entropy, None if that is zero.
     """
     names = ["accuracy", "cross_entropy", "penalty", "penalty_weight", "mean_abs_logit"]
+    names.append("weighted")
     found = []
     for row in plan.rows:
         for method in plan.methods:
             runs = [m for (r, a, _), m in learning.items() if (r, a) == (row.name, method)]
             if not runs:
                 continue
+            runs = [m.assign(weighted=m["penalty_weight"] * m["penalty"]) for m in runs]
             last = [m[m["round"] >= 0.9 * m["round"].max()][names].mean() for m in runs]
             means = pd.concat(last, axis=1).mean(axis=1)
-            share = means["penalty_weight"] * means["penalty"] / means["cross_entropy"]
+            entropy = means["cross_entropy"]
+            share = means["weighted"] / entropy if entropy > 0 else None
             values = {"row": row.name, "agent": method, "seeds": len(runs), "share": share}
             found.append(values | means.to_dict())
     return pd.DataFrame(found, columns=["row", "agent", "seeds", "share", *names])
@@ -288,7 +292,7 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
 def _saturated(ends: pd.DataFrame) -> list[str]:
     return [
         f"Saturated: {r.row}, {TITLES[r.agent]}: at the end of training the discriminator is right "
-        f"about {r.accuracy:.1%} of the samples and lambda times the penalty is {r.share:.1%} of "
+        f"about {r.accuracy:.1%} of the samples and lambda times the penalty is {_percent(r.share)} of "
         "the cross-entropy: there is little left for the penalty to change."
         for r in ends.itertuples()
         if r.penalty_weight > 0 and r.accuracy >= SATURATED
@@ -371,6 +375,10 @@ def _is_mixed(origins: Mapping[tuple, Any]) -> bool:
 
 
 # Tables for people
+
+
+def _percent(share: Any) -> str:
+    return "-" if share is None or pd.isna(share) else f"{share:.1%}"
 
 
 def _number(value: Any, digits: int = 1) -> str:
@@ -493,14 +501,15 @@ def _discriminator_table(ends: pd.DataFrame) -> Table:
             f"{r.accuracy:.1%}",
             f"{r.cross_entropy:.3f}",
             f"{r.penalty:.4f}",
-            f"{r.share:.1%}" if r.penalty_weight > 0 else "",
+            _percent(r.share) if r.penalty_weight > 0 else "",
             _number(r.mean_abs_logit),
         ]
         for r in ends.itertuples()
     ]
     note = (
         "Over the last tenth of the rounds, means over settings and seeds. Share: lambda times the "
-        "penalty, of the cross-entropy. Without a weight the penalty is only measured. A "
+        "penalty, of the cross-entropy; the estimate of the penalty is unbiased and may be negative. "
+        "Where --select kept an earlier round, these are still the last. Without a weight the penalty is only measured. A "
         "discriminator that is always right leaves it nothing to change."
     )
     columns = [

@@ -21,7 +21,7 @@ class Cell(msgspec.Struct, frozen=True, kw_only=False):
             trained in, measured in others too.
         measure: ``transfer``, ``zero-shot``, ``id``, or ``ood`` of an agent that learns nothing.
         seed: of the reward learning; None for agents without one.
-        place: the setting of the expert, where there is one for each.
+        place: the setting that an expert was trained in, or where another agent is measured.
         run: id of the evaluation; empty if it is not there.
         why: what a missing one waits for.
     """
@@ -178,4 +178,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 6, run)
+STAGE = Stage("report", 7, run)

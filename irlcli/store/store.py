@@ -122,6 +122,25 @@ class Damage(NamedTuple):
     newer: bool = False
 
 
+class Missing(NamedTuple):
+    """Who needs an artefact that is gone, and what is known of it: nothing, if not quarantined.
+
+    ``names`` point to it, the artefacts ``made`` were made from it.
+    """
+
+    names: list[str]
+    made: list[str]
+    place: Path | None
+    command: str
+
+    def text(self, id16: str) -> str:
+        """One line on the artefact ``id16``."""
+        needed = [f"the name {name!r} points to it" for name in self.names]
+        needed += [f"{', '.join(self.made)} came from it"] if self.made else []
+        where = f" (it was damaged and is in {self.place})" if self.place is not None else ""
+        return f"{id16} is gone{where}: {'; '.join(needed)}"
+
+
 class Resolved(NamedTuple):
     """What a reference names: an artefact and perhaps one of its outputs, or a foreign path."""
 
@@ -367,15 +386,20 @@ class Store:
         return self.get(id16)
 
     def _gone(self, name: str, id16: str) -> NotFound:
-        places = sorted(self._quarantine().glob(f"{id16}-*"))
-        if not places:
+        place = self._quarantined(id16)
+        if place is None:
             hint = "name another with `irl name`"
             return NotFound(f"the name {name!r} points to {id16}, which is gone", hint)
-        command = _recorded_command(places[-1])
+        command = _recorded_command(place)
         return NotFound(
-            f"the name {name!r} points to {id16}, which was damaged and is now in {places[-1]}",
+            f"the name {name!r} points to {id16}, which was damaged and is now in {place}",
             f"compute it again: {command}" if command else "compute it again",
         )
+
+    def _quarantined(self, id16: str) -> Path | None:
+        """Where the artefact was set aside last, if it was."""
+        places = sorted(self._quarantine().glob(f"{id16}-*"))
+        return places[-1] if places else None
 
     def _by_prefix(self, prefix: str) -> Artefact | None:
         if not re.fullmatch(_PREFIX, prefix):
@@ -669,8 +693,8 @@ class Store:
         What a newer version made is never among them, nor what its manifest mentions.
         """
         index = self.index()
-        for id16, by in self.missing(index).items():
-            self._warn(f"{id16} is gone, and needed by {', '.join(by)}: no history of it is kept")
+        for id16, lost in self.missing(index).items():
+            self._warn(f"{lost.text(id16)}: nothing that {id16} was made from is kept for it")
         kept = index.reached_from(self.names().values())
         limit = time.time() - grace_seconds
         return [
@@ -679,27 +703,31 @@ class Store:
             if id16 not in kept and _older(artefact.directory, limit)
         ]
 
-    def missing(self, index: Index) -> dict[str, list[str]]:
-        """Artefacts that a name or the history of a named one leads to, and that are gone.
+    def missing(self, index: Index) -> dict[str, Missing]:
+        """What a name points to, or something named was made from, and that is not there, by id.
 
-        By id: what needs them. ``gc`` never takes such an artefact away. An input that was a file
-        outside the store is not looked for. ``index`` is of now or of some time ago: what was made
-        since is not missed.
+        ``gc`` takes no such artefact away. A file from outside the store is not looked for, nor
+        what a provenance names that cannot be read. ``index`` is of now or of some time ago: what
+        was published since is not missed.
         """
         names = self.names()
         there = index.artefacts.keys() | index.newer.keys()
-        found: dict[str, list[str]] = {}
+        found: dict[str, Missing] = {}
+
+        def gone(id16: str) -> Missing:
+            place = self._quarantined(id16)
+            command = "" if place is None else _recorded_command(place)
+            return found.setdefault(id16, Missing([], [], place, command))
+
         for name, id16 in names.items():
             if id16 not in there and not (self.root / id16).is_dir():
-                found.setdefault(id16, []).append(f"the name {name!r}")
+                gone(id16).names.append(name)
         for id16 in sorted(index.reached_from(names.values())):
             artefact = index.artefacts[id16]
             lost = [role for role, held in index.parents(artefact).items() if not held]
-            places = artefact.provenance().get("inputs") or {} if lost else {}
-            for role in lost:
-                source, _, rest = str(places.get(role, "")).partition("/")
-                if rest and re.fullmatch(_ID, source) and source not in there:
-                    found.setdefault(source, []).append(id16)
+            for source in _stored_inputs(artefact, lost):
+                if source not in there:
+                    gone(source).made.append(id16)
         return found
 
     def stale_work(self, grace_seconds: float) -> list[Path]:
@@ -745,6 +773,18 @@ class Store:
             for directory in (self.root, self._keys(), self._names()):
                 remove_leftovers(directory)
             return artefacts, work
+
+
+def _stored_inputs(artefact: Artefact, roles: Iterable[str]) -> list[str]:
+    """The ids that the inputs ``roles`` were read from, those of files outside the store left out."""
+    try:
+        places = artefact.provenance().get("inputs") if roles else None
+    except IntegrityError:
+        return []
+    if not isinstance(places, dict):
+        return []
+    texts = [str(places.get(role, "")).partition("/") for role in roles]
+    return [id16 for id16, slash, _ in texts if slash and re.fullmatch(_ID, id16)]
 
 
 def _recorded_command(directory: Path) -> str:

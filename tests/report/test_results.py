@@ -203,21 +203,32 @@ def recorded(accuracy, penalty, weight):
 def test_a_discriminator_that_leaves_the_penalty_nothing_is_told():
     row, other = "lunar-lander bounce", "lunar-lander engine-power"
     learning = {
-        (row, "irm", 0): recorded(0.94, 0.001, 4.0),
-        (row, "irm", 1): recorded(0.98, 0.003, 4.0),
+        # (8 * 0.001 + 0.5 * 0.004) / 2 of 0.2, not the product of the means.
+        (row, "irm", 0): recorded(0.94, 0.001, 8.0),
+        (row, "irm", 1): recorded(0.98, 0.004, 0.5),
         (row, "erm", 0): recorded(0.99, 0.002, 0.0),
         (other, "irm", 0): recorded(0.60, 0.5, 4.0),
     }
     report = results.build(*made(full()), {}, learning)
     (note,) = report.notes
     assert note.startswith("Saturated: lunar-lander bounce, AIRL-IRM: ")
-    assert "96.0% of the samples" in note and "4.0% of the cross-entropy" in note
+    assert "96.0% of the samples" in note and "2.5% of the cross-entropy" in note
     (table,) = (t for t in report.tables if t.title == "The discriminator at the end")
     assert table.rows == [
         [row, "AIRL-ERM", "1", "99.0%", "0.200", "0.0020", "", "50.0"],
-        [row, "AIRL-IRM", "2", "96.0%", "0.200", "0.0020", "4.0%", "50.0"],
+        [row, "AIRL-IRM", "2", "96.0%", "0.200", "0.0025", "2.5%", "50.0"],
         [other, "AIRL-IRM", "1", "60.0%", "0.200", "0.5000", "1000.0%", "50.0"],
     ]
+
+
+def test_a_share_of_nothing_is_no_number():
+    row = "lunar-lander bounce"
+    certain = recorded(1.0, -0.0001, 4.0).assign(cross_entropy=0.0)
+    report = results.build(*made(full()), {}, {(row, "irm", 0): certain})
+    (note,) = report.notes
+    assert "lambda times the penalty is - of the cross-entropy" in note
+    (table,) = (t for t in report.tables if t.title == "The discriminator at the end")
+    assert table.rows[0][5:7] == ["-0.0001", "-"]
 
 
 def test_missing_seeds_are_counted_and_one_seed_has_no_p():

@@ -110,18 +110,73 @@ def test_verify_says_what_is_missing(irl, empty_store, publish):
     result = irl("verify", "--json", "--store", empty_store.root)
     said = json.loads(result.out)
     assert (result.code, said["exit_code"], said["checked"]) == (4, 4, 3)
-    assert said["missing"] == {demos.id: ["the name 'demos'", reward.id]}
+    assert said["missing"] == {demos.id: {"names": ["demos"], "made": [reward.id], "command": None}}
+    line = f"{demos.id} is gone: the name 'demos' points to it; {reward.id} came from it"
     result = irl("verify", "--store", empty_store.root)
-    lines = result.err.splitlines()
-    assert lines[0] == f"{demos.id} is gone, and needed by the name 'demos', {reward.id}"
-    assert lines[1] == f"error: 1 artefact missing: {demos.id}"
+    assert result.err.splitlines()[0] == line
+    assert "error: 1 of 3 names point to nothing: demos" in result.err
     collected = irl("gc", "--grace-days", "0", "--store", empty_store.root)
     assert collected.out.startswith(expert.id)
-    assert f"{lines[0]}: no history of it is kept" in collected.err
+    assert line in collected.err
+    # Made again with other bytes, it has its name again; the reward's history stays lost.
+    again = publish(empty_store, {"demos": b"other"}, parameters={"of": "again"}).artefact
+    empty_store.set_name("demos", again)
+    result = irl("verify", "--json", "--store", empty_store.root)
+    assert result.code == 0
+    lost = {"names": [], "made": [reward.id], "command": None}
+    assert json.loads(result.out)["missing"] == {demos.id: lost}
+    assert f"warning: {demos.id} is gone: {reward.id} came from it" in result.err
     # What no name needs may go.
-    for name in ("kept", "demos"):
-        (empty_store.root / ".names" / name).unlink()
-    assert irl("verify", "--store", empty_store.root).code == 0
+    (empty_store.root / ".names" / "kept").unlink()
+    result = irl("verify", "--json", "--store", empty_store.root)
+    assert (result.code, json.loads(result.out)["missing"]) == (0, {})
+
+
+def test_what_was_quarantined_is_missing_with_the_command_that_makes_it(irl, empty_store, publish):
+    made = publish(empty_store).artefact
+    empty_store.set_name("best", made)
+    (made.directory / "reward.pt").chmod(0o644)
+    (made.directory / "reward.pt").write_bytes(b"other")
+    assert "1 of 1 artefacts were damaged" in irl("verify", "--store", empty_store.root).err
+    result = irl("verify", "--store", empty_store.root)
+    assert result.code == 4
+    assert f"{made.id}: was made by: irl train-airl" in result.err
+    assert ".quarantine" in result.err
+
+
+@pytest.mark.parametrize(
+    "inputs", [["a"], "text", None, {"input": 3}, {"input": "0123456789abcdef"}]
+)
+def test_odd_provenance_leads_to_nothing_missing(irl, empty_store, monkeypatch, publish, inputs):
+    made = publish(empty_store, inputs={"input": "0" * 64}).artefact
+    empty_store.set_name("odd", made)
+    monkeypatch.setattr(store_module.Artefact, "provenance", lambda _: {"inputs": inputs})
+    for command in ("verify", "gc"):
+        assert irl(command, "--store", empty_store.root).code == 0
+
+
+def test_gc_goes_on_where_a_provenance_is_damaged(irl, empty_store, publish):
+    made = publish(empty_store, inputs={"input": "0" * 64}).artefact
+    empty_store.set_name("damaged", made)
+    path = made.directory / "provenance.json"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes().replace(b"train-airl", b"train-arli"))
+    assert irl("gc", "--store", empty_store.root).code == 0
+    assert irl("verify", "--store", empty_store.root).code == 4
+
+
+def test_an_input_of_a_newer_schema_is_not_missing(irl, empty_store, publish, mixed):
+    _, newer, _ = mixed
+    made = publish(
+        empty_store,
+        parameters={"of": "newer"},
+        inputs={"input": "1" * 64},
+        places={"input": f"{newer}/reward.pt"},
+    ).artefact
+    for name, id16 in (("made", made.id), ("best", newer)):
+        (empty_store.root / ".names" / name).write_text(f"{id16}\n")
+    result = irl("verify", "--json", "--store", empty_store.root)
+    assert (result.code, json.loads(result.out)["missing"]) == (0, {})
 
 
 def manifests_read(monkeypatch) -> list[str]:
