@@ -41,6 +41,10 @@ from irlcli.trajectories import Trajectory
 # Normalised observations and rewards are clipped to this, as in SB3's VecNormalize.
 _CLIP = 10.0
 
+# Of behavioural cloning: Adam's learning rate, and demonstrated steps a minibatch.
+_CLONING_RATE = 1e-3
+_CLONING_BATCH = 256
+
 Worlds = VectorWorlds | WorkerWorlds
 
 # Categorical re-checks its support on every one of millions of calls; SB3 builds it from
@@ -275,9 +279,7 @@ class PPOTrainer:
                 # SB3 schedules the learning rate and the clip range only.
                 self.model.ent_coef = self.ppo.ent_coef * remaining
             self.model.train()
-            if self.ppo.log_std_max is not UNSET:
-                with torch.no_grad():
-                    self.model.policy.log_std.clamp_(max=self.ppo.log_std_max)
+            self._cap_noise()
             if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
                 raise StageFailed(
                     f"the policy's parameters are not finite after an update in round {index}",
@@ -288,6 +290,38 @@ class PPOTrainer:
                 self.model.policy.features_extractor.update(seen.reshape(-1, seen.shape[-1]))
             rollouts.append(rollout)
         return rollouts
+
+    def clone(
+        self,
+        observations: np.ndarray,
+        log_likelihood: Callable[[np.ndarray], torch.Tensor],
+        epochs: int,
+    ) -> None:
+        """Fit the policy to demonstrations by maximum likelihood, before the first round.
+
+        Args:
+            observations: of the demonstrations, [B, D]; the running moments take them in.
+            log_likelihood: log pi(a|s) [b] of the demonstrations with indices [b], with gradient.
+            epochs: how often each demonstration is seen.
+        """
+        policy = self.model.policy
+        if self.ppo.normalise_observations:
+            policy.features_extractor.update(observations)
+        generator = torch.Generator().manual_seed(derive("cloning", self._seed, 0)[0])
+        optimizer = torch.optim.Adam(policy.parameters(), lr=_CLONING_RATE)
+        for _ in range(epochs):
+            order = torch.randperm(len(observations), generator=generator)
+            for rows in order.split(_CLONING_BATCH):
+                loss = -log_likelihood(rows.numpy()).mean()
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+        self._cap_noise()
+
+    def _cap_noise(self) -> None:
+        if self.ppo.log_std_max is not UNSET:
+            with torch.no_grad():
+                self.model.policy.log_std.clamp_(max=self.ppo.log_std_max)
 
     def _normalised(self, rewards: np.ndarray, rollout: Rollout) -> np.ndarray:
         """``rewards`` [T, N] over the deviation of their discounted sums, this rollout's included."""
@@ -391,14 +425,18 @@ class Policy:
             actions = distribution.mode() if deterministic else distribution.distribution.sample()
             return actions.numpy()
 
-    def log_prob(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """log pi(a|s) [B] for observations [B, D] and actions [B] or [B, A], without gradient."""
-        with torch.no_grad():
+    def log_prob(
+        self, observations: torch.Tensor, actions: torch.Tensor, gradient: bool = False
+    ) -> torch.Tensor:
+        """log pi(a|s) [B] for observations [B, D] and actions [B] or [B, A]."""
+        with torch.set_grad_enabled(gradient):
             return self.network.get_distribution(observations).log_prob(actions)
 
-    def gaussian(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and deviation [B, A] of pi(.|s) for observations [B, D], without gradient."""
-        with torch.no_grad():
+    def gaussian(
+        self, observations: torch.Tensor, gradient: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and deviation [B, A] of pi(.|s) for observations [B, D]."""
+        with torch.set_grad_enabled(gradient):
             distribution = self.network.get_distribution(observations).distribution
             return distribution.mean, distribution.stddev
 

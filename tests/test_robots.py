@@ -78,6 +78,34 @@ def test_a_cap_needs_continuous_actions():
         rl.PPOTrainer(worlds, PPOSettings(n_envs=1, log_std_max=-1.0), 1000, 0, "test")
 
 
+def test_a_clone_is_the_maximum_likelihood_fit():
+    """Actions drawn from one Gaussian wherever the robot is: the fit has its mean and deviation."""
+    trainer = make_trainer(**NORMALISED)
+    rng = np.random.default_rng(0)
+    observations = rng.normal(3.0, 2.0, (4096, trainer.policy.network.observation_space.shape[0]))
+    observations = observations.astype(np.float32)
+    mean, deviation = np.array([0.5, -0.3]), np.array([0.2, 0.6])
+    actions = torch.as_tensor(rng.normal(mean, deviation, (4096, 2)).astype(np.float32))
+
+    def log_likelihood(rows):
+        seen = torch.as_tensor(observations[rows])
+        return trainer.policy.log_prob(seen, actions[rows], gradient=True)
+
+    before = trainer.policy.state_dict()["value_net.weight"].clone()
+    trainer.clone(observations, log_likelihood, 150)
+    found = trainer.policy.gaussian(torch.as_tensor(observations))
+    np.testing.assert_allclose(found[0].mean(0), actions.mean(0), atol=0.02)
+    np.testing.assert_allclose(found[1][0], actions.std(0), rtol=0.05)
+    # The moments are those of the demonstrations, and the value of a state is not touched.
+    network = trainer.policy.network
+    np.testing.assert_allclose(network.features_extractor.mean, observations.mean(0), atol=1e-4)
+    assert torch.equal(trainer.policy.state_dict()["value_net.weight"], before)
+    capped = make_trainer(log_std_max=-1.0, **NORMALISED)
+    trainer = capped
+    capped.clone(observations, log_likelihood, 5)
+    assert capped.policy.network.log_std.max() == -1.0
+
+
 def test_demonstrations_hold_the_unclipped_sample():
     policy = make_trainer(log_std_init=1.0).policy
     (trajectory,) = rl.roll_out("reacher", SETTINGS[0], policy, 1, seed=4, purpose="test")

@@ -43,12 +43,12 @@ class SeenActions:
             return data
         return replace(data, actions=np.clip(data.actions, self._space.low, self._space.high))
 
-    def log_prob(self, policy: Policy, data: Transitions) -> torch.Tensor:
+    def log_prob(self, policy: Policy, data: Transitions, gradient: bool = False) -> torch.Tensor:
         """log pi(a|s) [B] of the transitions of ``of``."""
         observations = torch.as_tensor(data.observations)
         actions = torch.as_tensor(data.actions)
         if not self.clipped:
-            return policy.log_prob(observations, actions)
-        mean, std = policy.gaussian(observations)
+            return policy.log_prob(observations, actions, gradient)
+        mean, std = policy.gaussian(observations, gradient)
         low, high = torch.as_tensor(self._space.low), torch.as_tensor(self._space.high)
         return airl.clipped_log_prob(mean, std, actions, low, high)

@@ -11,6 +11,7 @@ import gymnasium
 import msgspec
 import numpy as np
 import torch
+from msgspec import UNSET
 
 from irlcli import checkpoints, descriptions
 from irlcli.dataset import Demonstrations
@@ -19,7 +20,7 @@ from irlcli.errors import IntegrityError, StageFailed
 from irlcli.interventions import environment
 from irlcli.irl import airl
 from irlcli.irl.networks import RewardModel
-from irlcli.rl import Policy, Rollout, world_groups
+from irlcli.rl import Policy, PPOTrainer, Rollout, world_groups
 from irlcli.seeds import derive
 from irlcli.settings import PENALISED, AIRLSettings
 from irlcli.stages.actions import SeenActions
@@ -114,6 +115,20 @@ class Adversary:
             self.config.ppo.gamma,
         )
         return reward.numpy().reshape(rollout.terminated.shape)
+
+    def clone_experts(self, trainer: PPOTrainer) -> None:
+        """Let the student of ``trainer`` begin as a clone of all experts, if that is asked for.
+
+        Every method's begins alike: each demonstrated step counts the same.
+        """
+        if self.config.clone_epochs is UNSET:
+            return
+        data = join(self._expert_settings)
+
+        def log_likelihood(rows: np.ndarray) -> torch.Tensor:
+            return self.actions.log_prob(trainer.policy, data.take(rows), gradient=True)
+
+        trainer.clone(data.observations, log_likelihood, self.config.clone_epochs)
 
     def train_round(
         self, index: int, rollouts: Sequence[Rollout], policy: Policy

@@ -41,6 +41,8 @@ def train_rounds(
     state = checkpoints.restore(job.checkpoints.load(), names, job.console.warn)
     if state is not None:
         first, rows = _resume(job, trainer, adversary, selection, state)
+    elif adversary is not None:
+        adversary.clone_experts(trainer)
     for index in range(first, trainer.rounds):
         rollouts = trainer.train_round(index, reward)
         _warn(job, index, rollouts, settings)

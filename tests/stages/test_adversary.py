@@ -1,18 +1,24 @@
 """Which transitions the discriminator sees: whole episodes, in the groups of the method."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 import torch
+from msgspec import UNSET
 
 from irlcli import rl
+from irlcli.checkpoints import to_bytes
 from irlcli.dataset import Demonstrations
 from irlcli.interventions import parse_settings
 from irlcli.seeds import derive
 from irlcli.settings import AIRLSettings, PPOSettings
+from irlcli.stages import Job
 from irlcli.stages.adversary import Adversary, deal, starts_by
+from irlcli.stages.policy_training import train_rounds
+from irlcli.trajectories import join
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.25x")
 CONFIG = AIRLSettings(updates_per_round=2, batch_size=32, ppo=PPOSettings(n_envs=8, n_steps=64))
@@ -139,3 +145,34 @@ def test_erm_pools_by_count(demos):
     _, (joined,), _ = adversary._grouped(pools, pools, [])
     assert len(joined.draw) == sum(len(pool.draw) for pool in pools)
     assert torch.equal(joined.observations, torch.cat([pool.observations for pool in pools]))
+
+
+def test_a_student_begins_as_a_clone_if_asked(demos):
+    """Of all experts, whatever the method; it takes the demonstrations for likelier than before."""
+    found = {}
+    for method, epochs in (("erm", UNSET), ("erm", 5), ("irm-shuffled", 5)):
+        trainer, adversary = make(demos, method=method, clone_epochs=epochs)
+        adversary.clone_experts(trainer)
+        data = join(adversary._expert_settings)
+        likelihood = float(adversary.actions.log_prob(trainer.policy, data).mean())
+        found[method, epochs] = likelihood, to_bytes(trainer.state_dict())
+    untouched, _ = make(demos)
+    assert found["erm", UNSET][1] == to_bytes(untouched.state_dict())
+    assert found["erm", 5][0] > found["erm", UNSET][0]
+    assert found["erm", 5] == found["irm-shuffled", 5]
+
+
+def test_a_resumed_clone_is_not_cloned_again(demos, tmp_path):
+    console = SimpleNamespace(progress=lambda *_: None, scalars=lambda *_: None, warn=pytest.fail)
+
+    def train(begin):
+        saved = []
+        keep = SimpleNamespace(load=lambda: begin, offer=lambda state: saved.append(state()))
+        trainer, adversary = make(demos, clone_epochs=2)
+        trainer.total_steps = 3 * trainer.steps_per_round
+        job = Job(None, {}, tmp_path, keep, console)
+        train_rounds(job, trainer, [str(s) for s in SETTINGS], adversary=adversary)
+        return saved
+
+    through = train(None)
+    assert train(through[0]) == through[1:]
