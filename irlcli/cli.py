@@ -476,8 +476,9 @@ def evaluate(
         artefacts = _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name)
     else:
         agent = "expert" if expert else "random" if random else "idle"
-        places = ood, intervention
-        artefacts = _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, name)
+        artefacts = _evaluate_agent(
+            session, agent, trained_in, ood, intervention, env, episodes, seed, name
+        )
     if artefacts and not session.as_json:
         from irlcli.references import evaluation
 
@@ -506,11 +507,10 @@ def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, na
     return session.deliver([request], name)
 
 
-def _evaluate_agent(session, agent, trained_in, places, env, episodes, seed, name):
+def _evaluate_agent(session, agent, trained_in, ood, intervention, env, episodes, seed, name):
     from irlcli.interventions import check_observed
     from irlcli.stages import From, evaluate, train_expert
 
-    ood, intervention = places
     if env is None or (ood is None and intervention is None):
         raise UsageError(
             f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"

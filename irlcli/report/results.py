@@ -228,8 +228,7 @@ def _ends(plan: Plan, learning: Learning) -> pd.DataFrame:
     Means over settings and seeds; ``share`` is that of lambda times the penalty over that of the
     cross-entropy, None if that is zero.
     """
-    names = ["accuracy", "cross_entropy", "penalty", "penalty_weight", "mean_abs_logit"]
-    names.append("weighted")
+    names = ["accuracy", "cross_entropy", "penalty", "penalty_weight", "weighted", "mean_abs_logit"]
     found = []
     for row in plan.rows:
         for method in plan.methods:
@@ -509,8 +508,8 @@ def _discriminator_table(ends: pd.DataFrame) -> Table:
     note = (
         "Over the last tenth of the rounds, means over settings and seeds. Share: lambda times the "
         "penalty, of the cross-entropy; the estimate of the penalty is unbiased and may be negative. "
-        "Where --select kept an earlier round, these are still the last. Without a weight the penalty is only measured. A "
-        "discriminator that is always right leaves it nothing to change."
+        "Where --select kept an earlier round, these are still the last. Without a weight the "
+        "penalty is only measured. A discriminator that is always right leaves it nothing to change."
     )
     columns = [
         "row",
