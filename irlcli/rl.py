@@ -169,9 +169,10 @@ class PPOTrainer:
     """SB3's PPO, one seeded round at a time.
 
     With ``normalise_observations`` the moments take in each rollout after the update on it, so
-    that the policy updated is the one that acted. With ``normalise_rewards`` PPO is paid the
-    rewards over the running standard deviation of their discounted sums (SB3's VecNormalize).
-    Rollouts hold raw observations and raw rewards either way.
+    that the policy updated is the one that acted; a clone keeps those of its demonstrations.
+    With ``normalise_rewards`` PPO is paid the rewards over the running standard deviation of
+    their discounted sums (SB3's VecNormalize). Rollouts hold raw observations and raw rewards
+    either way.
 
     Args:
         worlds: the environments to learn in.
@@ -198,6 +199,7 @@ class PPOTrainer:
                         f"ppo.{name} needs continuous actions", f"leave ppo.{name} unset"
                     )
         self._venv = _RecordingVecEnv(worlds)
+        self._cloned = False
         self._reward_moments = _moments(0.0, 1.0, 0.0)
         self._discounted = np.zeros(len(worlds))
         with warnings.catch_warnings():
@@ -285,7 +287,7 @@ class PPOTrainer:
                     f"the policy's parameters are not finite after an update in round {index}",
                     "a smaller learning rate or gradient norm usually helps",
                 )
-            if self.ppo.normalise_observations:
+            if self.ppo.normalise_observations and not self._cloned:
                 seen = rollout.observations
                 self.model.policy.features_extractor.update(seen.reshape(-1, seen.shape[-1]))
             rollouts.append(rollout)
@@ -299,12 +301,16 @@ class PPOTrainer:
     ) -> None:
         """Fit the policy to demonstrations by maximum likelihood, before the first round.
 
+        The moments of observations stay those of the demonstrations: others would make another
+        policy of the one fitted, before it has learned to earn by them.
+
         Args:
-            observations: of the demonstrations, [B, D]; the running moments take them in.
+            observations: of the demonstrations, [B, D].
             log_likelihood: log pi(a|s) [b] of the demonstrations with indices [b], with gradient.
             epochs: how often each demonstration is seen.
         """
         policy = self.model.policy
+        self._cloned = True
         if self.ppo.normalise_observations:
             policy.features_extractor.update(observations)
         generator = torch.Generator().manual_seed(derive("cloning", self._seed, 0)[0])
@@ -388,6 +394,7 @@ class PPOTrainer:
             "optimizer": self.model.policy.optimizer.state_dict(),
             "steps": self.model.num_timesteps,
             "reward_moments": [float(moments.mean), float(moments.var), float(moments.count)],
+            "cloned": self._cloned,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -395,8 +402,9 @@ class PPOTrainer:
         self.model.policy.load_state_dict(state["policy"])
         self.model.policy.optimizer.load_state_dict(state["optimizer"])
         self.model.num_timesteps = int(state["steps"])
-        # Checkpoints from before rewards could be normalised have none.
+        # Older checkpoints have neither of these.
         self._reward_moments = _moments(*state.get("reward_moments", (0.0, 1.0, 0.0)))
+        self._cloned = state.get("cloned", False)
 
 
 def _steps_per_round(ppo: PPOSettings) -> int:

@@ -136,7 +136,7 @@ class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     # the environment clips them to.
     actions: Literal["sampled", "executed"] | UnsetType = UNSET
     # Epochs of behavioural cloning with which the student begins; unset, it begins at random.
-    clone_epochs: Count | UnsetType = UNSET
+    bc_epochs: Count | UnsetType = UNSET
     # Which round is kept: the ``last``, as where unset, or the best on ``episodes`` held out of
     # every setting's demonstrations, or in one setting of these (``leg-length=1x``), which is
     # left out of training. Scored every so many rounds, a setting over so many episodes.

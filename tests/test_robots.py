@@ -106,6 +106,30 @@ def test_a_clone_is_the_maximum_likelihood_fit():
     assert capped.policy.network.log_std.max() == -1.0
 
 
+def test_a_clone_sees_what_its_demonstrations_normalise():
+    """Moments that took in other states would change the policy fitted; also after a restart."""
+    trainer = make_trainer(**NORMALISED)
+    observations = np.random.default_rng(0).normal(
+        size=(64, trainer._venv.observation_space.shape[0])
+    )
+    trainer.clone(
+        observations.astype(np.float32),
+        lambda rows: trainer.policy.network.log_std.sum() * torch.ones(len(rows)),
+        1,
+    )
+    resumed = make_trainer(**NORMALISED)
+    resumed.load_state_dict(from_bytes(to_bytes(trainer.state_dict())))
+    uncloned = make_trainer(**NORMALISED)
+    for each in (trainer, resumed, uncloned):
+        each.train_round(0)
+    for each in (trainer, resumed):
+        moments = each.policy.network.features_extractor
+        assert moments.count == 64
+        np.testing.assert_allclose(moments.mean, observations.mean(0), atol=1e-6)
+        np.testing.assert_allclose(moments.variance, observations.var(0), rtol=1e-5)
+    assert uncloned.policy.network.features_extractor.count == 320
+
+
 def test_demonstrations_hold_the_unclipped_sample():
     policy = make_trainer(log_std_init=1.0).policy
     (trajectory,) = rl.roll_out("reacher", SETTINGS[0], policy, 1, seed=4, purpose="test")

@@ -121,14 +121,14 @@ class Adversary:
 
         Every method's begins alike: each demonstrated step counts the same.
         """
-        if self.config.clone_epochs is UNSET:
+        if self.config.bc_epochs is UNSET:
             return
         data = join(self._expert_settings)
 
         def log_likelihood(rows: np.ndarray) -> torch.Tensor:
             return self.actions.log_prob(trainer.policy, data.take(rows), gradient=True)
 
-        trainer.clone(data.observations, log_likelihood, self.config.clone_epochs)
+        trainer.clone(data.observations, log_likelihood, self.config.bc_epochs)
 
     def train_round(
         self, index: int, rollouts: Sequence[Rollout], policy: Policy

@@ -151,7 +151,7 @@ def test_a_student_begins_as_a_clone_if_asked(demos):
     """Of all experts, whatever the method; it takes the demonstrations for likelier than before."""
     found = {}
     for method, epochs in (("erm", UNSET), ("erm", 5), ("irm-shuffled", 5)):
-        trainer, adversary = make(demos, method=method, clone_epochs=epochs)
+        trainer, adversary = make(demos, method=method, bc_epochs=epochs)
         adversary.clone_experts(trainer)
         data = join(adversary._expert_settings)
         likelihood = float(adversary.actions.log_prob(trainer.policy, data).mean())
@@ -168,7 +168,7 @@ def test_a_resumed_clone_is_not_cloned_again(demos, tmp_path):
     def train(begin):
         saved = []
         keep = SimpleNamespace(load=lambda: begin, offer=lambda state: saved.append(state()))
-        trainer, adversary = make(demos, clone_epochs=2)
+        trainer, adversary = make(demos, bc_epochs=2)
         trainer.total_steps = 3 * trainer.steps_per_round
         job = Job(None, {}, tmp_path, keep, console)
         train_rounds(job, trainer, [str(s) for s in SETTINGS], adversary=adversary)
