@@ -83,9 +83,12 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
 def agent_name(policy: Subject, setting: str) -> str:
     """``airl-irm transfer``, ``airl-erm zero-shot``, ``random``, ``idle``, or ``expert``.
 
-    One that was trained in another setting than ``setting`` is ``expert of bounce=0.1``.
+    One that was trained in another setting than ``setting`` is ``expert of bounce=0.1``, a
+    student where its demonstrations are from ``airl-erm in distribution``.
     """
     agent = policy.agent
     if agent == "expert" and policy.settings and setting not in policy.settings:
         return f"expert of {', '.join(policy.settings)}"
+    if agent == "student" and setting in policy.settings:
+        return f"airl-{policy.method} in distribution"
     return f"airl-{policy.method} {_WHAT[agent]}" if agent in _WHAT else agent

@@ -44,6 +44,13 @@ def test_experts_of_other_settings_are_rows_of_their_own():
     ]
 
 
+def test_a_student_is_zero_shot_only_where_no_one_showed_it_anything():
+    shown = {"bounce=0.9": "airl-irm in distribution", "bounce=0.1": "airl-irm zero-shot"}
+    for setting, agent in shown.items():
+        (row,) = rows([evaluation("student", 1.0, 0, method="irm", settings=(setting,))])
+        assert row.agent == agent
+
+
 def test_a_seed_that_comes_twice_is_refused():
     twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
     with pytest.raises(UsageError, match=r"airl-erm zero-shot in bounce=0\.9 has seed 3 twice"):
