@@ -11,7 +11,7 @@
 #                                  CHOOSE yours to say, so that no run takes another's name
 #   RESULTS=DIR                    where a report's files go, by default results/TAG/TARGET;
 #                                  what is published is RESULTS=docs/results/TARGET
-#   STORE=DIR                      artefact store
+#   STORE=DIR                      artefact store, by default IRL_STORE, else runs
 #   RUN="srun -c2"                 put before every irl command, e.g. to spread over a cluster
 #
 # Every recipe asks the store for an artefact by name: what is there already costs a moment, what
@@ -19,7 +19,7 @@
 
 PYTHON  ?= python3
 VENV    ?= .venv
-STORE   ?= runs
+STORE   ?= $(or $(IRL_STORE),runs)
 PROFILE ?= standard
 SEEDS   ?= 0 1 2 3 4
 METHODS ?= erm irm erm-balanced irm-shuffled

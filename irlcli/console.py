@@ -88,17 +88,13 @@ class TerminalConsole:
         """Another process makes the same artefact, or collects."""
         self.say(f"WAIT {label}: {holder} is at work on it")
 
-    def finish(self, artefact: Artefact, hit: bool) -> None:
+    def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
         """A stage ended, or its artefact was there."""
         self._close_live()
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-        record = artefact.manifest.record
-        if hit:
-            self.say(f"HIT {record.stage} {artefact.id}")
-        else:
-            self.say(f"DONE {self._label}: {artefact.directory}")
+        self.say(f"{'HIT' if hit else 'DONE'} {label}: {artefact.directory}")
 
     def close(self) -> None:
         """Leave the terminal as it was."""

@@ -50,7 +50,7 @@ class Silent(Console):
     def start(self, label: str, resumed: bool) -> None:
         pass
 
-    def finish(self, artefact: Artefact, hit: bool) -> None:
+    def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
         pass
 
     def wait(self, label: str, holder: str) -> None:
@@ -173,7 +173,7 @@ class Runner:
             with _file_errors_of(request.label):
                 artefact = self._make(request, record, sources)
         else:
-            self.console.finish(artefact, hit=True)
+            self.console.finish(request.label, artefact, hit=True)
         return artefact
 
     def _record(self, request: Request, inputs: Mapping[str, str]) -> KeyRecord:
@@ -187,7 +187,7 @@ class Runner:
             # The process that held the lock may have made it.
             artefact = self.store.find(record.key)
             if artefact is not None:
-                self.console.finish(artefact, hit=True)
+                self.console.finish(request.label, artefact, hit=True)
                 return artefact
             inputs = {role: self._checked(source) for role, source in sources.items()}
             checkpoints = _Checkpoints(
@@ -209,7 +209,7 @@ class Runner:
                 f"{request.label} gave other bytes than {published.diverged.id}, which holds the "
                 f"key: this result is kept as {published.artefact.id}"
             )
-        self.console.finish(published.artefact, hit=False)
+        self.console.finish(request.label, published.artefact, hit=False)
         if checkpoints.stop_requested:
             # A stage without rounds ends before it can answer the signal; what follows must not run.
             raise Interrupted(

@@ -421,6 +421,8 @@ def test_make_does_not_take_other_runs_for_the_plain_ones():
 
     plain = targets().stdout
     assert "results/standard/table1" in plain and "docs/" not in plain
+    assert "--store runs " in plain and "--store elsewhere " in targets("IRL_STORE=elsewhere").stdout
+    assert "--store here " in targets("IRL_STORE=elsewhere", "STORE=here").stdout
     smoke = targets("PROFILE=smoke").stdout
     assert "results/smoke/table1" in smoke and "docs/" not in smoke
     for word in ("SEEDS=0,1", "SEEDS=0'1", "SEEDS=", "SEEDS=0 0", "METHODS=imr", "METHODS="):

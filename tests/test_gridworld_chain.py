@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import os
 import signal
 import subprocess
@@ -91,7 +92,8 @@ def test_every_method_trains_and_is_found_again(run, demos, method):
     assert first.code == 0, first.err
     assert "blocked=1 (unseen)" in first.err
     again = run(*command)
-    assert again.out == first.out and "HIT train-maxent" in again.err
+    assert again.out == first.out
+    assert re.search(rf"HIT train-maxent .*path-group=1.*: {first.out.strip()}\n", again.err)
     assert run(*command, "--dry-run").out.startswith("HIT")
     artefact = Path(first.out.strip())
     description, tensors = checkpoints.load(artefact / "reward.pt", "tabular-reward")
