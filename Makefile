@@ -36,6 +36,9 @@ $(error SET and CHOOSE make other runs: say what to call them, e.g. TAG=mine)
 endif
 endif
 TAG ?= $(PROFILE)
+ifneq ($(words $(TAG)),1)
+$(error TAG="$(TAG)": write one word, which the names of all runs begin with)
+endif
 
 KNOWN   := erm irm erm-balanced irm-shuffled
 METHODS := $(strip $(METHODS))
@@ -47,6 +50,9 @@ DIGITS  := 0 1 2 3 4 5 6 7 8 9
 without  = $(if $(2),$(call without,$(subst $(firstword $(2)),,$(1)),$(wordlist 2,10,$(2))),$(1))
 ifneq ($(strip $(call without,$(SEEDS),$(DIGITS))),)
 $(error SEEDS="$(SEEDS)": write numbers with spaces between them, SEEDS="0 1 2")
+endif
+ifneq ($(filter 0%,$(filter-out 0,$(SEEDS))),)
+$(error SEEDS="$(SEEDS)": write numbers without zeros before them, SEEDS="0 1 2")
 endif
 ifneq ($(words $(SEEDS)),$(words $(sort $(SEEDS))))
 $(error SEEDS="$(SEEDS)": write each seed once, with spaces between them)

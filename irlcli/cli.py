@@ -594,7 +594,8 @@ def _named_settings(env, config, text, kind, origin):
         values = getattr(config.interventions[text], kind)
         if not values:
             raise UsageError(
-                f"settings/ lists no {kind.upper()} values of {text!r}", f"write {text}=VALUE,VALUE"
+                f"the settings list no {kind.upper()} values of {text!r}",
+                f"write {text}=VALUE,VALUE",
             )
         return parse_settings(env, f"{text}={','.join(values)}")
     if origin is None or text in environment(env).knobs or text[:1].isalpha():
@@ -729,6 +730,7 @@ def _method(learner: dict[str, Any]) -> list[Any]:
         learner.get("penalty") if method in PENALISED else None,
         f"lambda {_number(weight)}" if method in PENALISED else None,
         f"selecting by {select}" if select != "last" else None,
+        "from a clone" if "bc_epochs" in learner else None,
     ]
 
 
@@ -808,7 +810,9 @@ def _lineage_lines(node: dict[str, Any], indent: str) -> list[str]:
     lines = [f"{indent}{node['id']}  {node['stage']}  {node['about']}"]
     for item in node["inputs"]:
         if item["from"] is None:
-            lines.append(f"{indent}  {item['sha256'][:16]}  a file that is not in this store")
+            lines.append(
+                f"{indent}  a file that is not in this store, sha256 {item['sha256'][:16]}..."
+            )
         else:
             lines += _lineage_lines(item["from"], indent + "  ")
     return lines

@@ -258,9 +258,7 @@ def _check(values: Sequence[Any], what: str, known: Sequence[Any] | None = None)
         if known is not None and value not in known:
             raise UsageError(f"unknown {what} {value!r}", f"known: {', '.join(known)}")
         if value in values[:i]:
-            raise UsageError(
-                f"{what} {value} is named twice", "the sample is the seed: each counts once"
-            )
+            raise UsageError(f"{what} {value} is named twice", f"name each {what} once")
 
 
 def _row(

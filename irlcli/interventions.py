@@ -326,6 +326,23 @@ def world(setting: Setting) -> tuple[float, ...]:
     return numbers[:1] if kind == "range" and numbers[0] == numbers[1] else numbers
 
 
+def covers(wide: Setting, narrow: Setting) -> bool:
+    """Whether every world of ``narrow`` is one of ``wide``, as -5 and -5..0 are of -10..0."""
+    if wide.knob != narrow.knob or wide.value is None or wide.value.kind != "range":
+        return wide.knob == narrow.knob and world(wide) == world(narrow)
+    low, high = wide.value.numbers
+    return all(low <= number <= high for number in world(narrow))
+
+
+def overlap(one: Setting, other: Setting) -> bool:
+    """Whether they share worlds: one covers the other, or two ranges meet in more than an end."""
+    if covers(one, other) or covers(other, one):
+        return True
+    if not all(s.value is not None and s.value.kind == "range" for s in (one, other)):
+        return False
+    return max(world(one)[0], world(other)[0]) < min(world(one)[-1], world(other)[-1])
+
+
 def parse_setting(env: str, text: str) -> Setting:
     """The setting written as :class:`Setting` prints itself: ``default`` or ``knob=value``.
 

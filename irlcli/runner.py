@@ -143,7 +143,11 @@ class Runner:
         if artefact is not None:
             return Step("HIT", request.label, f"{artefact.directory}", artefact)
         if self.store.has_checkpoint(record.key):
-            return Step("RESUME", request.label, "an interrupted run left a checkpoint")
+            return Step(
+                "RESUME",
+                request.label,
+                "a checkpoint is there: the run was interrupted or is at work",
+            )
         return Step("RUN", request.label, f"no artefact has the key {record.key[:12]}")
 
     def run(self, request: Request) -> Artefact:

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from irlcli.errors import UsageError, suggest
-from irlcli.interventions import Setting, environment, knob_of, parse_settings, world
+from irlcli.interventions import Setting, environment, knob_of, overlap, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
 
@@ -135,8 +135,8 @@ class AIRLSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     # What g and log pi see of continuous actions: the policy's samples, as where unset, or what
     # the environment clips them to.
     actions: Literal["sampled", "executed"] | UnsetType = UNSET
-    # Epochs of behavioural cloning with which the student begins; unset, it begins at random.
-    bc_epochs: Count | UnsetType = UNSET
+    # Epochs of behavioural cloning with which the student begins: none, as where unset, if 0.
+    bc_epochs: NonNegativeCount | UnsetType = UNSET
     # Which round is kept: the ``last``, as where unset, or the best on ``episodes`` held out of
     # every setting's demonstrations, or in one setting of these (``leg-length=1x``), which is
     # left out of training. Scored every so many rounds, a setting over so many episodes.
@@ -362,11 +362,16 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Settings:
         raise UsageError(f"{field}: {message}", _field_hint(field)) from None
     for knob, values in settings.interventions.items():
         trained, unseen = (
-            [setting for value in part for setting in parse_settings(env, f"{knob}={value}")]
+            parse_settings(env, f"{knob}={','.join(part)}") if part else ()
             for part in (values.id, values.ood)
         )
-        worlds = {world(setting) for setting in trained}
-        if both := [str(setting) for setting in unseen if world(setting) in worlds]:
+        if len(values.episodes) not in (0, 1, len(trained)):
+            raise UsageError(
+                f"interventions.{knob}.episodes: {len(values.episodes)} episode counts for "
+                f"{len(trained)} settings",
+                "write one count for all, or one for each value of id",
+            )
+        if both := [str(s) for s in unseen if any(overlap(s, other) for other in trained)]:
             raise UsageError(
                 f"interventions.{knob}: {', '.join(both)} is both trained in (id) and held out (ood)",
                 "hold out what nothing is trained in",
@@ -416,9 +421,9 @@ def _override(item: str) -> dict[str, Any]:
             )
         fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
         if name not in fields:
-            raise UsageError(
-                f"--set {item!r}: no setting {dotted.strip()!r}", suggest(name, fields)
-            )
+            homes = [f"{home}.{name}" for home in _homes(name)] if len(path) == 1 else []
+            hint = f"did you mean {' or '.join(homes)}?" if homes else suggest(name, fields)
+            raise UsageError(f"--set {item!r}: no setting {dotted.strip()!r}", hint)
         kind = fields[name]
         if kind == _INTERVENTIONS:
             raise UsageError(
@@ -428,6 +433,16 @@ def _override(item: str) -> dict[str, Any]:
         names = ", ".join(f"{dotted.strip()}.{f.name}" for f in msgspec.structs.fields(kind))
         raise UsageError(f"--set {item!r} names a group of settings", f"one of: {names}")
     return _nest(path, _typed(text.strip(), kind, dotted.strip()))
+
+
+def _homes(name: str) -> list[str]:
+    """The groups of settings that have a field ``name``."""
+    groups = {f.name: f.type for f in msgspec.structs.fields(Settings)}
+    return [
+        group
+        for group, kind in groups.items()
+        if isinstance(kind, type) and issubclass(kind, Struct) and name in kind.__struct_fields__
+    ]
 
 
 def _typed(text: str, kind: Any, field: str) -> Any:
@@ -453,8 +468,9 @@ def _field_hint(field: str) -> str:
             return "see settings/ for examples"
         (kind,) = (f.type for f in msgspec.structs.fields(value) if f.name == name)
         value = getattr(value, name)
-    if get_origin(kind) is Literal:
-        return f"one of: {', '.join(get_args(kind))}"
+    for member in (kind, *get_args(kind)):
+        if get_origin(member) is Literal:
+            return f"one of: {', '.join(get_args(member))}"
     if value is UNSET:
         return "it is unset by default"
     return f"for example {msgspec.json.encode(value).decode()}"

@@ -258,8 +258,8 @@ def test_a_profile_without_runs_is_no_table(report, irl, table_store):
     [
         (["table3"], "unknown report 'table3'", "table1, figure2"),
         (["table1", "--methods", "erm,irn"], "unknown method 'irn'", "erm-balanced"),
-        (["table1", "--methods", "erm,erm"], "method erm is named twice", "counts once"),
-        (["table1", "--seeds", "0,0"], "seed 0 is named twice", "counts once"),
+        (["table1", "--methods", "erm,erm"], "method erm is named twice", "once"),
+        (["table1", "--seeds", "0,0"], "seed 0 is named twice", "once"),
         (["table1", "--seeds", "0-4"], "--seeds '0-4' is no list of seeds", "0,1,2,3,4"),
         (["table1", "--seeds", "-1"], "no seed -1 or below", "0 or more"),
         (["table1", "--env", "reacher"], "table1 has no row of 'reacher'", "ant, lunar-lander"),
@@ -421,13 +421,22 @@ def test_make_does_not_take_other_runs_for_the_plain_ones():
 
     plain = targets().stdout
     assert "results/standard/table1" in plain and "docs/" not in plain
-    assert "--store runs " in plain and "--store elsewhere " in targets("IRL_STORE=elsewhere").stdout
+    assert (
+        "--store runs " in plain and "--store elsewhere " in targets("IRL_STORE=elsewhere").stdout
+    )
     assert "--store here " in targets("IRL_STORE=elsewhere", "STORE=here").stdout
     smoke = targets("PROFILE=smoke").stdout
     assert "results/smoke/table1" in smoke and "docs/" not in smoke
     for word in ("SEEDS=0,1", "SEEDS=0'1", "SEEDS=", "SEEDS=0 0", "METHODS=imr", "METHODS="):
         refused = targets(word)
         assert refused.returncode != 0 and "with spaces between them" in refused.stderr
+    for word, said in (
+        ("SEEDS=0 01", "without zeros"),
+        ("TAG=a b", "one word"),
+        ("TAG=", "one word"),
+    ):
+        refused = targets(word)
+        assert refused.returncode != 0 and said in refused.stderr
     for word in ("SET=--set airl.penalty_weight=3", "CHOOSE=--choose-penalty 1,10"):
         refused = targets(word)
         assert refused.returncode != 0 and "TAG=mine" in refused.stderr

@@ -17,9 +17,11 @@ from irlcli.interventions import (
     Setting,
     Value,
     check_observed,
+    covers,
     env_kwargs,
     environment,
     knob_of,
+    overlap,
     parse_setting,
     parse_settings,
     parse_value,
@@ -313,6 +315,29 @@ def test_what_a_knob_says_of_observations_is_so():
         made.close()
         assert [len(sizes[observed]) for observed in (False, True)] == [1, 1]
         assert sizes[False] != sizes[True]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "covered", "shared"),
+    [
+        ("-10..0", "-5", True, True),
+        ("-10..0", "0", True, True),
+        ("-10..0", "-5..-1", True, True),
+        ("-10..0", "-5..5", False, True),
+        ("-10..0", "0..5", False, False),
+        ("-10..0", "10", False, False),
+        ("10", "10..10", True, True),
+        ("10", "10..12", False, True),
+        ("10", "11", False, False),
+    ],
+)
+def test_a_range_holds_the_worlds_between_its_ends(one, other, covered, shared):
+    a, b = (parse_setting("ant", f"direction={value}") for value in (one, other))
+    assert covers(a, b) == covered
+    assert overlap(a, b) == overlap(b, a) == shared
+    friction = parse_setting("ant", "friction=2:0.6:0.6")
+    assert not covers(a, friction) and not covers(friction, a) and not overlap(a, friction)
+    assert covers(friction, friction) and covers(Setting(), Setting())
 
 
 @pytest.mark.parametrize(

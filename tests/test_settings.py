@@ -179,6 +179,8 @@ def test_set_is_typed_by_its_field(item, value):
     [
         ("airl.penalty_weight", "has no '='", "--set airl.penalty_weight=30"),
         ("", "has no '='", "--set"),
+        ("bc_epochs=2", "no setting 'bc_epochs'", "did you mean airl.bc_epochs?"),
+        ("airl.actions=samples", "Invalid enum value", "one of: sampled, executed"),
         ("=3", "''", "known: "),
         ("airl=3", "group", "airl.method"),
         ("airl.ppo=3", "group", "airl.ppo.n_envs"),
@@ -294,6 +296,12 @@ def test_files_that_cannot_be_read(tmp_path):
         ("[interventions.mine]\nid = ['0.1']", "no intervention 'mine'", "bounce"),
         ("[interventions.bounc]\nid = ['0.1']", "no intervention 'bounc'", "did you mean 'bounce'"),
         ("[interventions.bounce]\nid = ['0.1', '0.90']\nood = ['0.9']", "bounce=0.9", "hold out"),
+        ("[interventions.bounce]\nid = ['0.1', '0.10']\nood = ['0.9']", "bounce=0.1 twice", "once"),
+        (
+            "[interventions.bounce]\nid = ['0.1', '0.5']\nood = ['0.9']\nepisodes = [1, 2, 3]",
+            "interventions.bounce.episodes: 3 episode counts for 2",
+            "one for each",
+        ),
         (
             "[interventions.engine-power]\nid = ['1x']\nood = ['1.0x']",
             "engine-power=1x is both",

@@ -9,6 +9,7 @@ from typing import Any
 
 from irlcli.descriptions import Evaluation, Subject
 from irlcli.errors import UsageError
+from irlcli.interventions import covers, parse_setting
 
 _ORDER = ("expert", "student", "transfer", "random", "idle")
 _WHAT = {"student": "zero-shot", "transfer": "transfer"}
@@ -89,6 +90,7 @@ def agent_name(policy: Subject, setting: str) -> str:
     agent = policy.agent
     if agent == "expert" and policy.settings and setting not in policy.settings:
         return f"expert of {', '.join(policy.settings)}"
-    if agent == "student" and setting in policy.settings:
+    shown = (parse_setting(policy.env, text) for text in policy.settings)
+    if agent == "student" and any(covers(s, parse_setting(policy.env, setting)) for s in shown):
         return f"airl-{policy.method} in distribution"
     return f"airl-{policy.method} {_WHAT[agent]}" if agent in _WHAT else agent

@@ -51,6 +51,8 @@ def request(
     airl = _resolved_selection(airl, texts)
     if airl.actions == "sampled":
         airl = msgspec.structs.replace(airl, actions=msgspec.UNSET)
+    if airl.bc_epochs == 0:
+        airl = msgspec.structs.replace(airl, bc_epochs=msgspec.UNSET)
     trained = len(_trained(airl, texts))
     if airl.ppo.n_envs % trained:
         raise UsageError(
@@ -91,7 +93,8 @@ def _resolved_selection(airl: AIRLSettings, settings: Sequence[str]) -> AIRLSett
 def _variant(airl: AIRLSettings) -> str:
     weight = f" lambda {airl.penalty_weight:g}" if airl.method in PENALISED else ""
     select = "" if airl.select is msgspec.UNSET else f" selecting by {airl.select}"
-    return f"{airl.method}{weight}{select}"
+    clone = "" if airl.bc_epochs is msgspec.UNSET else " from a clone"
+    return f"{airl.method}{weight}{select}{clone}"
 
 
 def _trained(airl: AIRLSettings, settings: Sequence[str]) -> tuple[str, ...]:

@@ -195,7 +195,7 @@ class Store:
             # Our own directories alone are a store whose creation was cut short.
             raise IntegrityError(
                 f"{self.root} has files in it but is no store",
-                "name an empty or a new directory with --store",
+                "name a store, or an empty or a new directory, with --store",
             )
         for name in _OWN:
             if (self.root / name).is_symlink():

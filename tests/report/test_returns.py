@@ -1,5 +1,6 @@
 """Rows of true returns: the sample is the seed, and no seed counts twice."""
 
+import msgspec
 import pytest
 
 from irlcli.descriptions import Evaluation, Returns, Subject
@@ -49,6 +50,18 @@ def test_a_student_is_zero_shot_only_where_no_one_showed_it_anything():
     for setting, agent in shown.items():
         (row,) = rows([evaluation("student", 1.0, 0, method="irm", settings=(setting,))])
         assert row.agent == agent
+    turned = evaluation("student", 1.0, 0, method="irm", settings=("direction=-10..0",))[0]
+    turned = msgspec.structs.replace(
+        turned,
+        policy=msgspec.structs.replace(turned.policy, env="ant"),
+        settings=tuple(
+            msgspec.structs.replace(turned.settings[0], setting=f"direction={value}")
+            for value in ("-5", "-10..0", "-10..10", "10")
+        ),
+    )
+    found = {row.setting: row.agent for row in rows([(turned, {})])}
+    assert [found[f"direction={v}"].split()[1] for v in ("-5", "-10..0")] == ["in", "in"]
+    assert [found[f"direction={v}"].split()[1] for v in ("-10..10", "10")] == ["zero-shot"] * 2
 
 
 def test_a_seed_that_comes_twice_is_refused():

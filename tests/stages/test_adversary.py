@@ -15,7 +15,7 @@ from irlcli.dataset import Demonstrations
 from irlcli.interventions import parse_settings
 from irlcli.seeds import derive
 from irlcli.settings import AIRLSettings, PPOSettings
-from irlcli.stages import Job
+from irlcli.stages import Job, train_airl
 from irlcli.stages.adversary import Adversary, deal, starts_by
 from irlcli.stages.policy_training import train_rounds
 from irlcli.trajectories import join
@@ -160,6 +160,16 @@ def test_a_student_begins_as_a_clone_if_asked(demos):
     assert found["erm", UNSET][1] == to_bytes(untouched.state_dict())
     assert found["erm", 5][0] > found["erm", UNSET][0]
     assert found["erm", 5] == found["irm-shuffled", 5]
+
+
+def test_no_epochs_of_cloning_are_no_clone(tmp_path):
+    """What settings/ ask for can be switched off, and is the run that nobody asked it for."""
+    made = {}
+    for epochs in (UNSET, 0, 3):
+        config = msgspec.structs.replace(CONFIG, bc_epochs=epochs)
+        made[epochs] = train_airl.request(tmp_path, "lunar-lander", SETTINGS, config)
+    assert made[0] == made[UNSET] != made[3]
+    assert made[3].label.count("from a clone") == 1 and "clone" not in made[0].label
 
 
 def test_a_resumed_clone_is_not_cloned_again(demos, tmp_path):
