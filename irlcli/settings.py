@@ -437,11 +437,11 @@ def _override(item: str) -> dict[str, Any]:
 
 def _homes(name: str) -> list[str]:
     """The groups of settings that have a field ``name``."""
-    groups = {f.name: f.type for f in msgspec.structs.fields(Settings)}
     return [
-        group
-        for group, kind in groups.items()
-        if isinstance(kind, type) and issubclass(kind, Struct) and name in kind.__struct_fields__
+        f.name
+        for f in msgspec.structs.fields(Settings)
+        if isinstance(f.type, type) and issubclass(f.type, Struct)
+        if name in f.type.__struct_fields__
     ]
 
 
