@@ -188,7 +188,8 @@ figure2: $(READY)
 RUNS    = $(foreach m,$(2),$(foreach s,$(3),$(1).$(m).$(s)))
 AGENTS  = $(addprefix $(1),.expert-returns .random-returns .idle-returns)
 ZERO    = $(call AGENTS,$(1)) $(addsuffix .zero-shot-returns,$(call RUNS,$(1),$(2),$(3)))
-RETURNS = $(call ZERO,$(1),$(2),$(3)) $(addsuffix .transfer-returns,$(call RUNS,$(1),$(2),$(3)))
+RETURNS = $(call ZERO,$(1),$(2),$(3)) $(foreach run,$(call RUNS,$(1),$(2),$(3)),\
+    $(run).transfer-returns $(run).expert-by-reward)
 CELLS   = $(addprefix $(NAMES)/,$(call $(1),$(TAG).$(2),$(METHODS),$(SEEDS)))
 
 # $(1) ENV.KNOB, $(2) ENV, $(3) KNOB
@@ -247,8 +248,12 @@ $(NAMES)/$(1).id-returns: $(NAMES)/$(1) FORCE
 $(NAMES)/$(1).transfer: $(NAMES)/$(1) FORCE
 	$$(RUN) $(IRL) transfer --reward $$(<F) --ood $(3) --seed $(5) $$(COMMON) --name $$(@F)
 
+# What the reward pays the policy that was trained on it, and what it would pay the expert there.
 $(NAMES)/$(1).transfer-returns: $(NAMES)/$(1).transfer FORCE
-	$$(RUN) $(IRL) evaluate --policy $$(<F) $$(COMMON) --name $$(@F)
+	$$(RUN) $(IRL) evaluate --policy $$(<F) --reward $(1) $$(COMMON) --name $$(@F)
+
+$(NAMES)/$(1).expert-by-reward: $(NAMES)/$(1) FORCE
+	$$(RUN) $(IRL) evaluate --expert --ood $(3) --reward $$(<F) $$(COMMON) --name $$(@F)
 endef
 
 $(foreach row,$(sort $(TABLE1) $(FIGURE3) $(FIGURE4)),$(eval \

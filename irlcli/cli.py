@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -419,8 +419,6 @@ def transfer(
     name: Name = None,
 ) -> None:
     """Train a new policy on a frozen reward in an unseen setting."""
-    import msgspec
-
     from irlcli.references import tensor_file
     from irlcli.stages import transfer
 
@@ -433,9 +431,16 @@ def transfer(
         raise UsageError(
             f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one"
         )
-    learned = _joined([*_method(msgspec.to_builtins(origin.airl)), f"seed {origin.seed}"])
+    learned = _learned_text(origin)
     request = transfer.request(source, origin.env, settings[0], config.transfer, seed, learned)
     session.deliver([request], name)
+
+
+def _learned_text(origin: Any) -> str:
+    """How a reward was learned, for the label of what stands on it."""
+    import msgspec
+
+    return _joined([*_method(msgspec.to_builtins(origin.airl)), f"seed {origin.seed}"])
 
 
 @command("evaluate")
@@ -449,6 +454,9 @@ def evaluate(
     ] = None,
     random: Annotated[bool, typer.Option("--random", help="Uniformly random actions.")] = False,
     idle: Annotated[bool, typer.Option("--idle", help="Does nothing.")] = False,
+    reward: Annotated[
+        str | None, typer.Option(help="Also what this learned reward pays: reward.pt or artefact.")
+    ] = None,
     ood: Annotated[
         str | None,
         typer.Option(help="VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB (OOD values)."),
@@ -461,7 +469,7 @@ def evaluate(
     seed: Seed = 0,
     name: Name = None,
 ) -> None:
-    """Measure the true return of a policy, an expert, or the random or idle agent."""
+    """Measure the return of a policy, an expert, or the random or idle agent."""
     agents = [policy is not None, expert, random, idle]
     if sum(agents) != 1:
         raise UsageError(
@@ -472,12 +480,14 @@ def evaluate(
         raise UsageError("--ood and --intervention both name settings", "give one of them")
     if trained_in is not None and not expert:
         raise UsageError("--trained-in says which experts, and none is evaluated", "add --expert")
+    where = (intervention, "id") if ood is None else (ood, "ood")
+    learned = None if reward is None else _reward(session, reward, env)
     if policy is not None:
-        artefacts = _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name)
+        artefacts = _evaluate_policy(session, policy, where, env, episodes, seed, learned, name)
     else:
         agent = "expert" if expert else "random" if random else "idle"
         artefacts = _evaluate_agent(
-            session, agent, trained_in, ood, intervention, env, episodes, seed, name
+            session, agent, trained_in, where, env, episodes, seed, learned, name
         )
     if artefacts and not session.as_json:
         from irlcli.references import evaluation
@@ -487,41 +497,69 @@ def evaluate(
         _print_returns(session, made, stderr=True)
 
 
-def _evaluate_policy(session, policy, ood, intervention, env, episodes, seed, name):
-    from irlcli.interventions import parse_setting
+class _Reward(NamedTuple):
+    """A reward that an evaluation measures by."""
+
+    ref: str
+    source: Any
+    origin: Any
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Those of ``evaluate.request``."""
+        return {"reward": self.source, "learned": _learned_text(self.origin)}
+
+
+def _reward(session: Session, ref: str, env: str | None) -> _Reward:
+    from irlcli.references import tensor_file
+
+    source, origin = tensor_file(session.store, ref, "reward")
+    _same_env(ref, origin.env, env)
+    return _Reward(ref, source, origin)
+
+
+def _evaluate_policy(session, policy, where, env, episodes, seed, learned, name):
+    from irlcli.interventions import check_observed, parse_setting
     from irlcli.references import tensor_file
     from irlcli.stages import evaluate
 
     source, origin = tensor_file(session.store, policy, "policy")
     _same_env(policy, origin.env, env)
     config = session.settings(origin.env, {"evaluation.episodes": episodes})
-    if ood is not None or intervention is not None:
-        kind = "id" if ood is None else "ood"
-        settings = _settings(origin.env, config, intervention if ood is None else ood, kind, origin)
+    if where[0] is not None:
+        settings = _settings(origin.env, config, *where, origin)
     else:
         settings = [parse_setting(origin.env, s) for s in origin.settings]
+    by = {}
+    if learned is not None:
+        _same_env(learned.ref, learned.origin.env, origin.env)
+        check_observed(origin.env, learned.origin.settings, settings)
+        by = learned.arguments
     who = f"expert of {', '.join(origin.settings)}"
     if origin.agent != "expert":
         who = _joined([origin.agent, origin.method, f"of seed {origin.seed}"])
-    request = evaluate.request(origin.env, settings, config.evaluation, source, seed=seed, who=who)
+    request = evaluate.request(
+        origin.env, settings, config.evaluation, source, seed=seed, who=who, **by
+    )
     return session.deliver([request], name)
 
 
-def _evaluate_agent(session, agent, trained_in, ood, intervention, env, episodes, seed, name):
+def _evaluate_agent(session, agent, trained_in, where, env, episodes, seed, learned, name):
     from irlcli.interventions import check_observed
     from irlcli.stages import From, evaluate, train_expert
 
-    if env is None or (ood is None and intervention is None):
+    origin, by = None, {}
+    if learned is not None:
+        origin, by = learned.origin, learned.arguments
+        env = origin.env
+    if env is None or where[0] is None:
         raise UsageError(
             f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"
         )
     config = session.settings(env, {"evaluation.episodes": episodes})
-    if ood is None:
-        settings = _settings(env, config, intervention, "id")
-    else:
-        settings = _settings(env, config, ood, "ood")
+    settings = _settings(env, config, *where, origin)
     if agent != "expert":
-        request = evaluate.request(env, settings, config.evaluation, agent=agent, seed=seed)
+        request = evaluate.request(env, settings, config.evaluation, agent=agent, seed=seed, **by)
         return session.deliver([request], name)
     if trained_in is None:
         wanted = [(setting, [setting]) for setting in settings]
@@ -542,6 +580,7 @@ def _evaluate_agent(session, agent, trained_in, ood, intervention, env, episodes
             From(train_expert.request(env, own, 0, config.expert_of(own)), "policy.pt"),
             seed=seed,
             who=f"expert of {own}",
+            **by,
         )
         for own, measured in wanted
     ]
@@ -744,12 +783,17 @@ def _origin(record: Any, makers: dict[str, Any]) -> str:
     ``makers`` has what made each output, by the output's content.
     """
     parts = []
+    evaluated_by = record.inputs.get("reward") if record.stage == "evaluate" else None
     for role in ("policy", "reward"):
         maker = makers.get(record.inputs.get(role))
-        if maker is not None:
+        if maker is not None and record.inputs[role] != evaluated_by:
             expert_of = maker.parameters.get("setting") if maker.stage == "train-expert" else None
             parts.append(_joined(["of", maker.stage, expert_of, *_learned(maker.parameters)]))
             record = maker
+    if evaluated_by is not None:
+        maker = makers.get(evaluated_by)
+        learned = _learned(maker.parameters) if maker is not None else ["a file"]
+        parts.append(_joined(["by the reward of", *learned]))
     return "".join(f" {part}" for part in parts)
 
 
@@ -1159,6 +1203,7 @@ def _print_returns(session: Session, evaluations: Sequence[Any], stderr: bool = 
                 "mean": row.mean,
                 "std_over_seeds": row.deviation,
                 "mean_progress": row.progress,
+                "mean_learned_return": row.learned,
                 "episodes_per_seed": row.episodes,
             }
             for row in found
@@ -1177,10 +1222,12 @@ def _print_returns(session: Session, evaluations: Sequence[Any], stderr: bool = 
         for row in found
     ]
     columns = ["agent", "setting", "true return", "sd over seeds", "seeds", "episodes each"]
-    if any(row.progress is not None for row in found):
-        columns.insert(3, "progress")
-        for cells, row in zip(table, found, strict=True):
-            cells.insert(3, "-" if row.progress is None else f"{row.progress:.1f}")
+    more = {"learned return": [r.learned for r in found], "progress": [r.progress for r in found]}
+    for column, values in more.items():
+        if any(value is not None for value in values):
+            columns.insert(3, column)
+            for cells, value in zip(table, values, strict=True):
+                cells.insert(3, "-" if value is None else f"{value:.1f}")
     out.print_table(columns, table, stderr=stderr)
 
 

@@ -124,24 +124,35 @@ class Subject(Struct, frozen=True, kw_only=True):
     method: AdversarialMethod | None = None
     seed: int | None = None
     reward_seed: int | None = None
+    reward_settings: tuple[str, ...] | None = None
+
+
+class LearnedReward(Struct, frozen=True, kw_only=True):
+    """Which reward an evaluation measured a policy by, besides the true one."""
+
+    method: AdversarialMethod
+    seed: int
+    settings: tuple[str, ...]
 
 
 class Returns(Struct, frozen=True, kw_only=True):
-    """True returns in one setting."""
+    """True returns in one setting; of a learned reward, the mean of g / scale per episode."""
 
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
     mean_return: Finite
     std_return: Finite | None = None
     mean_progress: Finite | None = None
+    mean_learned_return: Finite | None = None
     mean_length: Finite | None = None
     terminated: Finite | None = None
 
 
 class Evaluation(Struct, frozen=True, kw_only=True):
-    """``summary.json`` of an evaluation."""
+    """``summary.json`` of an evaluation; ``reward`` is there if it was asked for what that pays."""
 
     policy: Subject
+    reward: LearnedReward | None = None
     settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
 
 

@@ -278,9 +278,15 @@ def _row(
     name = f"{env} {knob}"
     demos = collect_experts.request(env, trained, config, 0, listed.episodes)
 
-    def measured(places: Sequence[Any], policy: Request | None, agent: str = "policy") -> Request:
+    def measured(
+        places: Sequence[Any],
+        policy: Request | None,
+        agent: str = "policy",
+        reward: Request | None = None,
+    ) -> Request:
         source = None if policy is None else From(policy, "policy.pt")
-        return evaluate.request(env, places, config.evaluation, source, agent)
+        paid = None if reward is None else From(reward, "reward.pt")
+        return evaluate.request(env, places, config.evaluation, source, agent, reward=paid)
 
     def expert(place: Any) -> Request:
         return train_expert.request(env, place, 0, config.expert_of(place))
@@ -325,7 +331,12 @@ def _row(
             for measure in measures:
                 places, policy, curves = where[measure]
                 cell = results.Cell(name, method, measure, seed)
-                planned.append(_Planned(cell, measured(places, policy), curves))
+                reward = airl if measure == "transfer" else None
+                planned.append(_Planned(cell, measured(places, policy, reward=reward), curves))
+            if "transfer" in measures:
+                cell = results.Cell(name, method, "expert by reward", seed, str(unseen[0]))
+                paid = measured(unseen, expert(unseen[0]), reward=airl)
+                planned.append(_Planned(cell, paid, {}))
     tree = msgspec.to_builtins(config)
     row = results.Row(
         env=env,

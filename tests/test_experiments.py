@@ -49,7 +49,9 @@ def table_store(tmp_path_factory, run_irl):
                 moved = f"{name}.transfer"
                 to = ["--ood", "engine-power", "--seed", seed, "--name", moved]
                 irl("transfer", "--reward", name, *to)
-                irl("evaluate", "--policy", moved, "--name", f"{moved}-returns")
+                irl("evaluate", "--policy", moved, "--reward", name, "--name", f"{moved}-returns")
+                there = ["--expert", "--ood", "engine-power", "--reward", name]
+                irl("evaluate", *there, "--name", f"{name}.expert")
     return store
 
 
@@ -101,6 +103,39 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
     assert erm["mean"] == pytest.approx(mine.mean(), rel=1e-5)
     assert erm["deviation"] == pytest.approx(mine.std(), rel=1e-4)
     assert cells.loc[("lunar-lander bounce", "erm", "transfer"), "seeds"] == 0
+
+
+def test_what_the_rewards_pay_is_that_of_the_evaluations(report, table_store):
+    directory = Path(report("table1", table_store, *ROW).out.strip())
+    store = Store(table_store)
+    paid = json.loads((directory / "table1.json").read_text())["paid"]
+    assert [(r["row"], r["agent"], r["seeds"]) for r in paid] == [
+        ("lunar-lander engine-power", "erm", 2),
+        ("lunar-lander engine-power", "irm", 1),
+    ]
+
+    def mean(name):
+        artefact = store.resolve(name).artefact
+        episodes = pd.read_parquet(artefact.directory / "episodes.parquet")
+        return episodes["learned_return"].mean()
+
+    policies, experts = (
+        [mean(f"erm.{seed}.{x}") for seed in "01"] for x in ("transfer-returns", "expert")
+    )
+    assert paid[0]["policy"] == pytest.approx(sum(policies) / 2)
+    assert paid[0]["expert"] == pytest.approx(sum(experts) / 2)
+    assert paid[0]["more"] == sum(a >= b for a, b in zip(policies, experts, strict=True))
+    points = pd.read_csv(directory / "seeds.csv")
+    by_reward = points[points["measure"] == "expert by reward"]
+    assert set(by_reward["expert_of"]) == {"engine-power=1.5x"}
+    assert sorted(by_reward["learned_return"]) == pytest.approx(
+        sorted([*experts, mean("irm.0.expert")]), rel=1e-5
+    )
+    # The experts' true return is no sample of any method's.
+    assert not any(
+        "the same returns to the bit" in n and "by reward" in n
+        for n in notes(report("table1", table_store, *ROW))
+    )
 
 
 def test_experts_are_carried_over_to_every_setting(report, irl, table_store):

@@ -90,6 +90,14 @@ def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
     return max(float(g.double().std()), 1e-6)
 
 
+def episode_reward(model: RewardModel, data: Transitions, absorbing: bool) -> float:
+    """Undiscounted sum of g over ``data``, with ``absorbing`` up to the horizon."""
+    with torch.no_grad():
+        pool = make_pool(model, data, torch.zeros(len(data)), absorbing)
+        g = model.reward(pool.observations, pool.actions)
+    return float(g.double()[pool.draw].sum())
+
+
 @dataclass(frozen=True)
 class Minibatch:
     """Discriminator samples, every tensor [E, 2, B] or [E, 2, B, .]."""

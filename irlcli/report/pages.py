@@ -157,15 +157,16 @@ def _seeds(report: Report) -> Table:
             "-" if pd.isna(p.seed) else f"{p.seed:.0f}",
             p.setting,
             f"{p.true_return:.1f}",
-            "-" if pd.isna(p.progress) else f"{p.progress:.1f}",
+            *("-" if pd.isna(v) else f"{v:.1f}" for v in (p.progress, p.learned_return)),
             str(p.episodes),
             p.evaluation,
         ]
         for p in report.points.itertuples()
     ]
     columns = ["row", "agent", "measure", "seed", "setting", "true return", "progress"]
+    columns += ["learned return", "episodes", "evaluation"]
     note = "A number is the mean over an evaluation's episodes."
-    return Table("Every seed in numbers", note, [*columns, "episodes", "evaluation"], rows, 5)
+    return Table("Every seed in numbers", note, columns, rows, 5)
 
 
 def _lineage(plan: Plan) -> str:

@@ -28,6 +28,8 @@ MEASURES = {
     "zero-shot": "Zero-shot: the student, in the unseen setting",
     "id": "In distribution: the student, mean over the settings trained in",
 }
+# What the unseen setting's expert earns of a learned reward, for each seed of a method.
+EXPERT_PAID = "expert by reward"
 BASELINES = ("expert", "carried", "random", "idle")
 # The comparison the paper makes first, then those with the controls.
 _PAIRS = (("irm", "erm"), ("irm", "erm-balanced"), ("irm", "irm-shuffled"))
@@ -69,9 +71,12 @@ class Report:
     Attributes:
         points: a row per evaluation and setting: ``row``, ``agent``, ``measure``, ``seed``,
             ``expert_of`` (the setting that an expert was trained in), ``setting``, ``true_return``,
-            ``progress``, ``episodes``, ``evaluation`` (its id).
+            ``progress``, ``learned_return``, ``episodes``, ``evaluation`` (its id).
         cells: a row per row, agent and measure.
         comparisons: a row per row, measure and pair of methods.
+        paid: a row per row and method: what the frozen rewards pay the new policies (``policy``)
+            and the setting's expert (``expert``), means over ``seeds``; ``more``: seeds in which
+            the policy earns at least what the expert does.
         tables: the same for people.
         notes: what must be known before the numbers are believed.
     """
@@ -79,6 +84,7 @@ class Report:
     points: pd.DataFrame
     cells: pd.DataFrame
     comparisons: pd.DataFrame
+    paid: pd.DataFrame
     tables: list[Table]
     notes: list[str]
 
@@ -99,9 +105,11 @@ def build(plan: Plan, points: pd.DataFrame, episodes: Episodes, learning: Learni
     ends = _ends(plan, learning)
     cells = _cells(plan, points)
     comparisons = _comparisons(plan, points, cells)
+    paid = _paid(plan, points)
     notes = [
         *_missing(plan),
         *_not_imitated(cells),
+        *_at_fault(cells, paid),
         *_saturated(ends),
         *_identical(episodes),
         *_without_p(comparisons),
@@ -109,9 +117,14 @@ def build(plan: Plan, points: pd.DataFrame, episodes: Episodes, learning: Learni
         *_mixed(plan),
     ]
     tables = [_main_table(plan, m, cells, comparisons) for m in plan.measures]
-    tables += [_comparison_table(comparisons), _discriminator_table(ends), _cell_table(cells)]
+    tables += [
+        _paid_table(paid),
+        _comparison_table(comparisons),
+        _discriminator_table(ends),
+        _cell_table(cells),
+    ]
     tables += [_budgets(plan), _costs(plan)]
-    return Report(points, cells, comparisons, [t for t in tables if t.rows], notes)
+    return Report(points, cells, comparisons, paid, [t for t in tables if t.rows], notes)
 
 
 def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
@@ -245,6 +258,28 @@ def _ends(plan: Plan, learning: Learning) -> pd.DataFrame:
     return pd.DataFrame(found, columns=["row", "agent", "seeds", "share", *names])
 
 
+def _paid(plan: Plan, points: pd.DataFrame) -> pd.DataFrame:
+    found = []
+    for row in plan.rows if "transfer" in plan.measures else ():
+        for method in plan.methods:
+            of = points[(points["row"] == row.name) & (points["agent"] == method)]
+            by_seed = of.pivot_table("learned_return", "seed", "measure")
+            both = by_seed.reindex(columns=["transfer", EXPERT_PAID]).dropna()
+            if len(both):
+                policy, expert = both["transfer"], both[EXPERT_PAID]
+                found.append(
+                    {
+                        "row": row.name,
+                        "agent": method,
+                        "seeds": len(both),
+                        "policy": float(policy.mean()),
+                        "expert": float(expert.mean()),
+                        "more": int((policy >= expert).sum()),
+                    }
+                )
+    return pd.DataFrame(found, columns=["row", "agent", "seeds", "policy", "expert", "more"])
+
+
 # Reservations
 
 
@@ -256,7 +291,7 @@ def _missing(plan: Plan) -> list[str]:
         reasons: dict[str, dict[str, dict[str, None]]] = {}
         for c in cells:
             if not c.run:
-                which = c.place or ("" if c.seed is None else f"{c.seed}")
+                which = c.place if c.seed is None else f"{c.seed}"
                 agent = TITLES[c.agent]
                 if c.seed is not None and c.why.startswith("evaluate"):
                     # A run has several evaluations; any other stage stands for all of them.
@@ -286,6 +321,28 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
                 f"{IMITATED:.0%} of the expert{share}; a gap to another method is noise."
             )
     return notes
+
+
+def _at_fault(cells: pd.DataFrame, paid: pd.DataFrame) -> list[str]:
+    """Why new policies fall short of the expert: a reward that prefers them, or the training."""
+    means = cells.set_index(["row", "agent", "measure"])["mean"]
+    notes = []
+    for r in paid.itertuples():
+        expert = means.get((r.row, "expert", "ood"))
+        reached = imitates(means[r.row, r.agent, "transfer"], None if pd.isna(expert) else expert)
+        if reached is not None and not reached:
+            notes.append(
+                f"Short of the expert: {r.row}, {TITLES[r.agent]}: the new policies earn "
+                f"{_number(r.policy)} of their reward an episode, the setting's expert "
+                f"{_number(r.expert)}. {_why_short(r.more, r.seeds)}."
+            )
+    return notes
+
+
+def _why_short(more: int, seeds: int) -> str:
+    reward = f"in {more} of {seeds} seeds the reward prefers the new policy: it is wrong here"
+    training = f"in {seeds - more} of {seeds} seeds the expert: there the training fell short"
+    return ", ".join([reward] * (more > 0) + [training] * (more < seeds)).capitalize()
 
 
 def _saturated(ends: pd.DataFrame) -> list[str]:
@@ -461,6 +518,29 @@ def _printed_p(row: paper.Row, welch: bool) -> float:
     return float(test.pvalue)
 
 
+def _paid_table(paid: pd.DataFrame) -> Table:
+    lines = [
+        [
+            r.row,
+            TITLES[r.agent],
+            str(r.seeds),
+            _number(r.policy),
+            _number(r.expert),
+            f"{r.more}/{r.seeds}",
+        ]
+        for r in paid.itertuples()
+    ]
+    note = (
+        "The frozen reward of an episode, undiscounted, of the new policy trained on it and of the "
+        "expert of the unseen setting; means over seeds. Where the new policy earns more, the reward "
+        "prefers what it does, and no longer training would lead to the expert; where it earns "
+        "less, the training did not find what the reward asks for. One unit is the standard deviation "
+        "of g on the training data; a sum over a whole episode, its zero means nothing."
+    )
+    columns = ["row", "agent", "seeds", "new policy", "expert", "new policy ahead"]
+    return Table("What the learned reward pays", note, columns, lines, heads=2)
+
+
 def _comparison_table(comparisons: pd.DataFrame) -> Table:
     lines = []
     for r in comparisons[comparisons["difference"].notna()].itertuples():
@@ -631,6 +711,7 @@ def as_json(report: Report) -> dict[str, Any]:
     return {
         "cells": records(report.cells),
         "comparisons": records(report.comparisons),
+        "paid": records(report.paid),
         "points": records(report.points),
         "tables": [t._asdict() for t in report.tables],
         "notes": report.notes,

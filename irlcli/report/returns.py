@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from irlcli.descriptions import Evaluation, Subject
+from irlcli.descriptions import Evaluation, LearnedReward, Subject
 from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 
@@ -25,6 +25,7 @@ class Row:
     returns: tuple[float, ...]  # mean true return of each seed
     episodes: int  # per seed
     progress: float | None = None  # mean over seeds; None if the environment reports none
+    learned: float | None = None  # mean over seeds of what a learned reward pays per episode
 
     @property
     def mean(self) -> float:
@@ -40,6 +41,9 @@ class Row:
 def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Row]:
     """Rows of evaluations, one per agent, method and setting: experts first, random and idle last.
 
+    An agent that was measured by another reward than its own is a row for each method of that, its
+    seeds those of the reward.
+
     Args:
         evaluations: ``summary.json``, and the parameters behind it that no seed may change.
 
@@ -49,15 +53,19 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
     """
     made: dict[tuple[int, str, str, str], Mapping[str, Any]] = {}
     seen: set[tuple] = set()
-    groups: dict[tuple[int, str, str, str], list[tuple[float, int, float | None]]] = {}
+    groups: dict[tuple[int, str, str, str], list[tuple]] = {}
     for summary, parameters in evaluations:
-        policy = summary.policy
+        policy, reward = summary.policy, summary.reward
         order = _ORDER.index(policy.agent)
         for item in summary.settings:
             agent = agent_name(policy, item.setting)
-            key = (order, agent, policy.env, item.setting)
-            values = item.mean_return, item.episodes, item.mean_progress
             seed = policy.seed if policy.reward_seed is None else policy.reward_seed
+            learned_from = policy.reward_settings or policy.settings
+            own = LearnedReward(method=policy.method, seed=seed, settings=learned_from)
+            if reward not in (None, own):
+                agent, seed = f"{agent} on airl-{reward.method}'s reward", reward.seed
+            key = (order, agent, policy.env, item.setting)
+            values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
             if (*key, seed) in seen:
                 raise UsageError(
                     f"{agent} in {item.setting} has seed {seed} twice",
@@ -75,9 +83,9 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
             groups.setdefault(key, []).append(values)
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):
-        returns, episodes, progress = zip(*items, strict=True)
-        mean = None if None in progress else statistics.fmean(progress)
-        found.append(Row(agent, env, setting, returns, min(episodes), mean))
+        returns, episodes, *others = zip(*items, strict=True)
+        means = (None if None in values else statistics.fmean(values) for values in others)
+        found.append(Row(agent, env, setting, returns, min(episodes), *means))
     return found
 
 

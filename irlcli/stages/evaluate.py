@@ -1,6 +1,7 @@
-"""True return of a policy over whole episodes, in one or more settings."""
+"""Return of a policy over whole episodes, true and by a learned reward, in its settings or others."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from typing import Literal
 
 import msgspec
@@ -14,7 +15,7 @@ Agent = Literal["policy", "random", "idle"]
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What an evaluation depends on, besides the policy."""
+    """What an evaluation depends on, besides the policy and the reward."""
 
     env: str
     physics: int
@@ -32,10 +33,13 @@ def request(
     agent: Agent = "policy",
     seed: int = 0,
     who: str = "",
+    reward: Source | From | None = None,
+    learned: str = "",
 ) -> Request:
     """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``settings_``.
 
-    ``who`` says in the label whose policy it is.
+    With ``reward``, a ``reward.pt``, also what that would pay. ``who`` says in the label whose
+    policy it is, ``learned`` how the reward was learned; they are no part of the identity.
     Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
 
     Raises:
@@ -56,8 +60,10 @@ def request(
         seed=seed,
         evaluation=evaluation,
     )
-    inputs = {} if policy is None else {"policy": policy}
+    inputs = {"policy": policy, "reward": reward}
+    inputs = {role: source for role, source in inputs.items() if source is not None}
     label = f"evaluate {who or agent} in {env} {', '.join(texts)} seed {seed}"
+    label += f" by the reward of {learned}" if reward is not None else ""
     return Request(STAGE, parameters, inputs, label)
 
 
@@ -66,9 +72,10 @@ def run(job: Job) -> None:
     import numpy as np
     import pyarrow as pa
 
-    from irlcli import rl
+    from irlcli import envs, rl
     from irlcli.checkpoints import load_policy_file
     from irlcli.dataset import write_table
+    from irlcli.stages.frozen_reward import FrozenReward
     from irlcli.stages.outputs import shown, warn_of_errors, write_json
 
     p: Parameters = job.parameters
@@ -77,11 +84,16 @@ def run(job: Job) -> None:
         policy, origin = load_policy_file(job.inputs["policy"])
         subject = msgspec.to_builtins(origin)
         del subject["network"]
-    rows, summary = [], []
+    rows, summary, said = [], [], {"policy": subject}
     for index, text in enumerate(p.settings):
+        setting, reward = parse_setting(p.env, text), None
+        if "reward" in job.inputs:
+            with closing(envs.make(p.env, setting)) as world:
+                spaces = world.observation_space, world.action_space
+            reward = FrozenReward(job.inputs["reward"], p.env, f"{p.env} {text}", *spaces)
         trajectories = rl.roll_out(
             p.env,
-            parse_setting(p.env, text),
+            setting,
             policy,
             p.evaluation.episodes,
             p.seed,
@@ -114,11 +126,18 @@ def run(job: Job) -> None:
                 "terminated": float(np.mean([t.terminated for t in trajectories])),
             }
         )
+        if reward is not None:
+            learned = [reward.of_episode(t) for t in trajectories]
+            for row, value in zip(rows[-len(learned) :], learned, strict=True):
+                row["learned_return"] = value
+            summary[-1]["mean_learned_return"] = float(np.mean(learned))
+            about = {name: getattr(reward.origin, name) for name in ("method", "seed", "settings")}
+            said["reward"] = about
         job.console.progress(
             index + 1, len(p.settings), "settings", {text: shown(returns.mean(), progress)}
         )
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
-    write_json(job.output / "summary.json", {"policy": subject, "settings": summary})
+    write_json(job.output / "summary.json", said | {"settings": summary})
 
 
 STAGE = Stage("evaluate", 3, run)

@@ -19,7 +19,8 @@ class Cell(msgspec.Struct, frozen=True, kw_only=False):
         row: ``ENV KNOB``.
         agent: a method, ``expert``, ``random``, ``idle``, or ``carried``: an expert of a setting
             trained in, measured in others too.
-        measure: ``transfer``, ``zero-shot``, ``id``, or ``ood`` of an agent that learns nothing.
+        measure: ``transfer``, ``zero-shot``, ``id``, or ``ood`` of an agent that learns nothing;
+            ``expert by reward``: what the unseen setting's expert earns of the seed's reward.
         seed: of the reward learning; None for agents without one.
         place: the setting that an expert was trained in, or where another agent is measured.
         run: id of the evaluation; empty if it is not there.
@@ -137,19 +138,21 @@ def run(job: Job) -> None:
         path = directory / "summary.json"
         summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         base = {"row": cell.row, "agent": cell.agent, "measure": cell.measure, "seed": cell.seed}
-        base["expert_of"] = cell.place if cell.agent in ("expert", "carried") else ""
+        of_expert = cell.agent in ("expert", "carried") or cell.measure == results.EXPERT_PAID
+        base["expert_of"] = cell.place if of_expert else ""
         points += [
             {
                 **base,
                 "setting": place.setting,
                 "true_return": place.mean_return,
                 "progress": place.mean_progress,
+                "learned_return": place.mean_learned_return,
                 "episodes": place.episodes,
                 "evaluation": cell.run,
             }
             for place in summary.settings
         ]
-        if cell.seed is not None:
+        if cell.seed is not None and cell.measure in p.measures:
             returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
             group = episodes.setdefault((cell.row, cell.measure), {})
             group[cell.agent, cell.seed] = returns["true_return"].to_numpy()
@@ -178,4 +181,4 @@ def run(job: Job) -> None:
 
 
 _CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
-STAGE = Stage("report", 7, run)
+STAGE = Stage("report", 8, run)

@@ -111,6 +111,18 @@ def test_absorbing_value_equals_stepping_the_environment(form):
     assert closed == pytest.approx((discounts * paid).sum().item(), rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.parametrize("absorbing", [False, True])
+def test_an_episodes_reward_is_the_sum_over_its_horizon(absorbing):
+    model = make_model()
+    data = make_transitions(6, terminated=[5], remaining=7)
+    s, a, s_next, _ = as_tensors(model, data)
+    steps = [float(model.reward(s[t : t + 1], a[t : t + 1])) for t in range(6)]
+    if absorbing:
+        # No action is an action vector of zeros.
+        steps += [float(model.reward(s_next[5:], torch.zeros(1, 4)))] * 7
+    assert airl.episode_reward(model, data, absorbing) == pytest.approx(sum(steps), rel=1e-5)
+
+
 def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
     model = make_model()
     data = make_transitions(10, terminated=[3, 7], remaining=6)

@@ -73,6 +73,7 @@ def made(values, **more):
                         **{"row": row, "agent": agent, "measure": measure},
                         **{"seed": seed if learns else None, "setting": "bounce=0.9"},
                         **{"true_return": value, "progress": None, "episodes": 20},
+                        "learned_return": None,
                         "evaluation": id16,
                     }
                 )
@@ -219,6 +220,53 @@ def test_a_discriminator_that_leaves_the_penalty_nothing_is_told():
         [row, "AIRL-IRM", "2", "96.0%", "0.200", "0.0025", "2.5%", "50.0"],
         [other, "AIRL-IRM", "1", "60.0%", "0.200", "0.5000", "1000.0%", "50.0"],
     ]
+
+
+def paid(values):
+    """The report on :func:`full` with (new policy, expert) of each seed by (row, method)."""
+    whole = full()
+    for (row, method), pairs in values.items():
+        whole[row, method, results.EXPERT_PAID] = [250.0 for _ in pairs]
+    plan, points = made(whole)
+    for (row, method), pairs in values.items():
+        for measure, column in (("transfer", 0), (results.EXPERT_PAID, 1)):
+            chosen = (points["row"] == row) & (points["agent"] == method)
+            chosen &= points["measure"] == measure
+            points.loc[chosen, "learned_return"] = [pair[column] for pair in pairs]
+    return results.build(plan, points, {}, {})
+
+
+def test_a_new_policy_that_falls_short_is_the_rewards_fault_or_the_trainings():
+    row = "lunar-lander bounce"
+    report = paid({(row, "erm"): [(4, 1), (5, 1), (9, 10)], (row, "irm"): [(1, 2), (1, 2), (1, 2)]})
+    assert report.paid.to_dict("records") == [
+        {"row": row, "agent": "erm", "seeds": 3, "policy": 6.0, "expert": 4.0, "more": 2},
+        {"row": row, "agent": "irm", "seeds": 3, "policy": 1.0, "expert": 2.0, "more": 0},
+    ]
+    short = [note for note in report.notes if note.startswith("Short of the expert")]
+    assert short == [
+        f"Short of the expert: {row}, AIRL-ERM: the new policies earn 6.0 of their reward an "
+        "episode, the setting's expert 4.0. In 2 of 3 seeds the reward prefers the new policy: it "
+        "is wrong here, in 1 of 3 seeds the expert: there the training fell short.",
+        f"Short of the expert: {row}, AIRL-IRM: the new policies earn 1.0 of their reward an "
+        "episode, the setting's expert 2.0. In 3 of 3 seeds the expert: there the training fell "
+        "short.",
+    ]
+    (table,) = (t for t in report.tables if t.title == "What the learned reward pays")
+    assert [line[-1] for line in table.rows] == ["2/3", "0/3"]
+    # The expert's returns under the rewards are in no cell.
+    assert set(report.cells["measure"]) == {"ood", "id", "transfer", "zero-shot"}
+
+
+def test_a_new_policy_as_good_as_the_expert_needs_no_excuse():
+    row = "lunar-lander bounce"
+    whole = full() | {(row, "erm", "transfer"): [240.0, 250.0, 260.0]}
+    whole[row, "erm", results.EXPERT_PAID] = [250.0] * 3
+    plan, points = made(whole)
+    points["learned_return"] = 1.0
+    report = results.build(plan, points, {}, {})
+    assert list(report.paid["agent"]) == ["erm"]
+    assert not any(note.startswith("Short of") for note in report.notes)
 
 
 def test_a_share_of_nothing_is_no_number():

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from irlcli.descriptions import Evaluation, Returns, Subject
+from irlcli.descriptions import Evaluation, LearnedReward, Returns, Subject
 from irlcli.errors import UsageError
 from irlcli.report.returns import rows
 
@@ -62,6 +62,41 @@ def test_a_student_is_zero_shot_only_where_no_one_showed_it_anything():
     found = {row.setting: row.agent for row in rows([(turned, {})])}
     assert [found[f"direction={v}"].split()[1] for v in ("-5", "-10..0")] == ["in", "in"]
     assert [found[f"direction={v}"].split()[1] for v in ("-10..10", "10")] == ["zero-shot"] * 2
+
+
+def test_what_another_reward_pays_is_a_row_of_its_own():
+    trained_in = ("bounce=0.1",)
+
+    def by_reward(agent, seed, learned, **subject):
+        summary, made = evaluation(agent, 5.0, 0, **subject)
+        (place,) = summary.settings
+        return msgspec.structs.replace(
+            summary,
+            reward=LearnedReward(method="irm", seed=seed, settings=trained_in),
+            settings=(msgspec.structs.replace(place, mean_learned_return=learned),),
+        ), made
+
+    own = {"method": "irm", "reward_settings": trained_in}
+    found = rows(
+        [
+            *(by_reward("expert", seed, learned) for seed, learned in ((0, -2.0), (1, -4.0))),
+            by_reward("transfer", 1, 7.0, reward_seed=1, **own),
+            by_reward("transfer", 2, 9.0, reward_seed=1, **own),
+            by_reward(
+                "transfer", 3, 8.0, reward_seed=3, method="irm", reward_settings=("bounce=0",)
+            ),
+            by_reward("student", 0, 6.0, method="irm", settings=trained_in),
+            evaluation("idle", 1.0),
+        ]
+    )
+    other = "on airl-irm's reward"
+    assert {row.agent: (row.learned, len(row.returns)) for row in found} == {
+        f"expert {other}": (-3.0, 2),
+        "airl-irm zero-shot": (6.0, 1),
+        "airl-irm transfer": (7.0, 1),
+        f"airl-irm transfer {other}": (8.5, 2),
+        "idle": (None, 1),
+    }
 
 
 def test_a_seed_that_comes_twice_is_refused():
