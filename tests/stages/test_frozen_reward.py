@@ -80,8 +80,11 @@ def test_evaluate_says_what_the_reward_pays(irl, store_copy, agent):
     assert other != made
     assert "learned_return" not in pd.read_parquet(other / "episodes.parquet")
     assert "reward" not in json.loads((other / "summary.json").read_text())
-    listed = irl("ls", "--store", store_copy.path).out
-    assert any(made.name in line and "by the reward of" in line for line in listed.splitlines())
+    listed = irl("ls", "--store", store_copy.path).out.splitlines()
+    (line,) = (line for line in listed if made.name in line)
+    assert "by the reward of irm lambda" in line
+    # A reward that only measures made no policy.
+    assert ("of train-airl" in line) == (agent == "policy")
 
 
 def test_observations_of_another_size_are_refused(smoke_store):
