@@ -786,7 +786,8 @@ def _origin(record: Any, makers: dict[str, Any]) -> str:
     evaluated_by = record.inputs.get("reward") if record.stage == "evaluate" else None
     for role in ("policy", "reward"):
         maker = makers.get(record.inputs.get(role))
-        if maker is not None and record.inputs[role] != evaluated_by:
+        measures = record.stage == "evaluate" and role == "reward"
+        if maker is not None and not measures:
             expert_of = maker.parameters.get("setting") if maker.stage == "train-expert" else None
             parts.append(_joined(["of", maker.stage, expert_of, *_learned(maker.parameters)]))
             record = maker
