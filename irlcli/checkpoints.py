@@ -224,6 +224,8 @@ def load_reward_file(path: Path) -> tuple[RewardModel, descriptions.Reward]:
         model.load_state_dict(state)
     except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise _misfit(path, error) from None
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in model.state_dict().values()):
+        raise IntegrityError(f"{path} holds numbers that are not finite")
     return model.requires_grad_(False).eval(), description
 
 

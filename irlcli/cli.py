@@ -490,10 +490,11 @@ def evaluate(
             session, agent, trained_in, where, env, episodes, seed, learned, name
         )
     if artefacts and not session.as_json:
-        from irlcli.references import evaluation
+        from irlcli.references import by_own_reward, evaluation
 
+        own = reward is not None and by_own_reward(artefacts[0], session.store.index())
         # Of one policy, or of one expert for each setting: nothing is pooled.
-        made = [(evaluation(session.store, a.id)[1], {}) for a in artefacts]
+        made = [(evaluation(session.store, a.id)[1], {}, own) for a in artefacts]
         _print_returns(session, made, stderr=True)
 
 
@@ -553,8 +554,9 @@ def _evaluate_agent(session, agent, trained_in, where, env, episodes, seed, lear
         origin, by = learned.origin, learned.arguments
         env = origin.env
     if env is None or where[0] is None:
+        missing = "--env ENV " if env is None else ""
         raise UsageError(
-            f"--{agent} does not say where", "add --env ENV --intervention KNOB=VALUE,VALUE"
+            f"--{agent} does not say where", f"add {missing}--intervention KNOB=VALUE,VALUE"
         )
     config = session.settings(env, {"evaluation.episodes": episodes})
     settings = _settings(env, config, *where, origin)
@@ -1183,11 +1185,12 @@ def _report_figure2(session: Session, name: str | None) -> None:
 
 
 def _report_returns(session: Session, refs: Sequence[str]) -> None:
-    from irlcli.references import circumstances, evaluation
+    from irlcli.references import by_own_reward, circumstances, evaluation
 
     named = [evaluation(session.store, ref) for ref in refs]
     index = session.store.index()
-    _print_returns(session, [(summary, circumstances(a, index)) for a, summary in named])
+    made = [(s, circumstances(a, index), by_own_reward(a, index)) for a, s in named]
+    _print_returns(session, made)
 
 
 def _print_returns(session: Session, evaluations: Sequence[Any], stderr: bool = False) -> None:
@@ -1224,11 +1227,11 @@ def _print_returns(session: Session, evaluations: Sequence[Any], stderr: bool = 
     ]
     columns = ["agent", "setting", "true return", "sd over seeds", "seeds", "episodes each"]
     more = {"learned return": [r.learned for r in found], "progress": [r.progress for r in found]}
-    for column, values in more.items():
+    for place, (column, values) in zip((4, 3), more.items(), strict=True):
         if any(value is not None for value in values):
-            columns.insert(3, column)
+            columns.insert(place, column)
             for cells, value in zip(table, values, strict=True):
-                cells.insert(3, "-" if value is None else f"{value:.1f}")
+                cells.insert(place, "-" if value is None else f"{value:.1f}")
     out.print_table(columns, table, stderr=stderr)
 
 

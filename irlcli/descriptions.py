@@ -124,7 +124,6 @@ class Subject(Struct, frozen=True, kw_only=True):
     method: AdversarialMethod | None = None
     seed: int | None = None
     reward_seed: int | None = None
-    reward_settings: tuple[str, ...] | None = None
 
 
 class LearnedReward(Struct, frozen=True, kw_only=True):

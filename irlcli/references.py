@@ -100,24 +100,44 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
     """Every parameter behind an evaluation that its seeds have in common: ``STAGE.FIELD`` to value.
 
     Without the seeds themselves, and without a lambda that was chosen for each of them. Of what
-    came from outside the store only the content is known.
+    came from outside the store only the content is known. A reward that is not the policy's own
+    has ``reward.`` before its names.
     """
     found: dict[str, Any] = {}
-    pending = [artefact]
+    pending = [(artefact, "")]
     while pending:
-        record = pending.pop().manifest.record
+        at, prefix = pending.pop()
+        record = at.manifest.record
         for name, value in flat(record.parameters):
             chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
             if name not in ("seed", "settings", "setting") and not chosen:
-                found[f"{record.stage}.{name}"] = value
+                found[f"{prefix}{record.stage}.{name}"] = value
         for role in ("policy", "reward", "demonstrations"):
+            measures = record.stage == "evaluate" and role == "reward"
             sha = record.inputs.get(role)
-            makers = [] if sha is None else index.holders(sha)
-            if role == "demonstrations" and sha is not None:
-                found[f"{record.stage}.{role}"] = sha
+            if sha is None or (measures and by_own_reward(at, index)):
+                continue
+            makers = index.holders(sha)
+            if role == "demonstrations":
+                found[f"{prefix}{record.stage}.{role}"] = sha
             elif makers:
-                pending.append(makers[0])
+                pending.append((makers[0], "reward." if measures else prefix))
     return found
+
+
+def by_own_reward(evaluation: Artefact, index: Index) -> bool:
+    """Whether the reward that an evaluation measured by is the one its policy was trained on."""
+    inputs = evaluation.manifest.record.inputs
+    if "reward" not in inputs or "policy" not in inputs:
+        return False
+    return any(
+        inputs["reward"] in (maker.manifest.record.inputs.get("reward"), *_contents(maker))
+        for maker in index.holders(inputs["policy"])
+    )
+
+
+def _contents(artefact: Artefact) -> list[str]:
+    return [output.sha256 for output in artefact.manifest.outputs]
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -124,7 +124,6 @@ def test_what_the_rewards_pay_is_that_of_the_evaluations(report, table_store):
     )
     assert paid[0]["policy"] == pytest.approx(sum(policies) / 2)
     assert paid[0]["expert"] == pytest.approx(sum(experts) / 2)
-    assert paid[0]["more"] == sum(a >= b for a, b in zip(policies, experts, strict=True))
     points = pd.read_csv(directory / "seeds.csv")
     by_reward = points[points["measure"] == "expert by reward"]
     assert set(by_reward["expert_of"]) == {"engine-power=1.5x"}
@@ -164,6 +163,29 @@ def test_experts_are_carried_over_to_every_setting(report, irl, table_store):
     said = irl("evaluate", "--expert", *where, *small).err
     assert re.search(r"^expert +lunar-lander engine-power=1x ", said, re.M)
     assert re.search(r"^expert of engine-power=1x +lunar-lander engine-power=1.25x ", said, re.M)
+
+
+def test_a_transfer_evaluated_without_its_reward_counts_too(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    store = Store(copy)
+    common = ["--store", copy, "--profile", "smoke", *SMALL]
+    paid = store.resolve("erm.0.transfer-returns").artefact
+    assert irl("evaluate", "--policy", "erm.0.transfer", *common).code == 0
+    with_reward = Path(report("table1", copy, *ROW).out.strip())
+    shutil.rmtree(paid.directory)
+    without = Path(report("table1", copy, *ROW).out.strip())
+    tables = [json.loads((d / "table1.json").read_text()) for d in (with_reward, without)]
+    cells = [
+        next(
+            c
+            for c in t["cells"]
+            if (c["agent"], c["measure"]) == ("erm", "transfer") and c["seeds"]
+        )
+        for t in tables
+    ]
+    assert cells[0]["mean"] == cells[1]["mean"] and cells[1]["seeds"] == 2
+    assert [[r["seeds"] for r in t["paid"] if r["agent"] == "erm"] for t in tables] == [[2], [1]]
 
 
 def test_what_is_missing_is_said(report, table_store):

@@ -75,8 +75,9 @@ class Report:
         cells: a row per row, agent and measure.
         comparisons: a row per row, measure and pair of methods.
         paid: a row per row and method: what the frozen rewards pay the new policies (``policy``)
-            and the setting's expert (``expert``), means over ``seeds``; ``more``: seeds in which
-            the policy earns at least what the expert does.
+            and the setting's expert (``expert``), means over ``seeds``; ``short``: seeds in which
+            the policy's true return is not within a fifth of the expert's, ``short_paid_more``:
+            those of them in which it is nevertheless paid more.
         tables: the same for people.
         notes: what must be known before the numbers are believed.
     """
@@ -109,7 +110,7 @@ def build(plan: Plan, points: pd.DataFrame, episodes: Episodes, learning: Learni
     notes = [
         *_missing(plan),
         *_not_imitated(cells),
-        *_at_fault(cells, paid),
+        *_short(paid),
         *_saturated(ends),
         *_identical(episodes),
         *_without_p(comparisons),
@@ -259,25 +260,23 @@ def _ends(plan: Plan, learning: Learning) -> pd.DataFrame:
 
 
 def _paid(plan: Plan, points: pd.DataFrame) -> pd.DataFrame:
+    columns = ["row", "agent", "seeds", "policy", "expert", "short", "short_paid_more"]
     found = []
     for row in plan.rows if "transfer" in plan.measures else ():
         for method in plan.methods:
             of = points[(points["row"] == row.name) & (points["agent"] == method)]
-            by_seed = of.pivot_table("learned_return", "seed", "measure")
-            both = by_seed.reindex(columns=["transfer", EXPERT_PAID]).dropna()
-            if len(both):
-                policy, expert = both["transfer"], both[EXPERT_PAID]
-                found.append(
-                    {
-                        "row": row.name,
-                        "agent": method,
-                        "seeds": len(both),
-                        "policy": float(policy.mean()),
-                        "expert": float(expert.mean()),
-                        "more": int((policy >= expert).sum()),
-                    }
-                )
-    return pd.DataFrame(found, columns=["row", "agent", "seeds", "policy", "expert", "more"])
+            of = of[of["learned_return"].notna()]
+            policies, experts = (of[of["measure"] == m] for m in ("transfer", EXPERT_PAID))
+            both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
+            if both.empty:
+                continue
+            returns = zip(both["true_return"], both["true_return_expert"], strict=True)
+            short = np.array([not imitates(policy, expert) for policy, expert in returns])
+            paid, offered = both["learned_return"], both["learned_return_expert"]
+            means = float(paid.mean()), float(offered.mean())
+            counts = int(short.sum()), int((short & (paid > offered)).sum())
+            found.append((row.name, method, len(both), *means, *counts))
+    return pd.DataFrame(found, columns=columns)
 
 
 # Reservations
@@ -323,26 +322,16 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
     return notes
 
 
-def _at_fault(cells: pd.DataFrame, paid: pd.DataFrame) -> list[str]:
-    """Why new policies fall short of the expert: a reward that prefers them, or the training."""
-    means = cells.set_index(["row", "agent", "measure"])["mean"]
-    notes = []
-    for r in paid.itertuples():
-        expert = means.get((r.row, "expert", "ood"))
-        reached = imitates(means[r.row, r.agent, "transfer"], None if pd.isna(expert) else expert)
-        if reached is not None and not reached:
-            notes.append(
-                f"Short of the expert: {r.row}, {TITLES[r.agent]}: the new policies earn "
-                f"{_number(r.policy)} of their reward an episode, the setting's expert "
-                f"{_number(r.expert)}. {_why_short(r.more, r.seeds)}."
-            )
-    return notes
-
-
-def _why_short(more: int, seeds: int) -> str:
-    reward = f"in {more} of {seeds} seeds the reward prefers the new policy: it is wrong here"
-    training = f"in {seeds - more} of {seeds} seeds the expert: there the training fell short"
-    return ", ".join([reward] * (more > 0) + [training] * (more < seeds)).capitalize()
+def _short(paid: pd.DataFrame) -> list[str]:
+    """Where new policies fall short of the expert: whether their reward says so too."""
+    return [
+        f"Short of the expert: {r.row}, {TITLES[r.agent]}: {r.short} of {r.seeds} new policies. "
+        f"{r.short_paid_more} of them are paid more of their learned reward than the setting's expert "
+        "would be, so that the reward does not lead to it; the others less, so that they do not "
+        "earn what it offers either."
+        for r in paid.itertuples()
+        if r.short
+    ]
 
 
 def _saturated(ends: pd.DataFrame) -> list[str]:
@@ -526,18 +515,21 @@ def _paid_table(paid: pd.DataFrame) -> Table:
             str(r.seeds),
             _number(r.policy),
             _number(r.expert),
-            f"{r.more}/{r.seeds}",
+            f"{r.short}/{r.seeds}",
+            f"{r.short_paid_more}/{r.short}" if r.short else "",
         ]
         for r in paid.itertuples()
     ]
     note = (
-        "The frozen reward of an episode, undiscounted, of the new policy trained on it and of the "
-        "expert of the unseen setting; means over seeds. Where the new policy earns more, the reward "
-        "prefers what it does, and no longer training would lead to the expert; where it earns "
-        "less, the training did not find what the reward asks for. One unit is the standard deviation "
-        "of g on the training data; a sum over a whole episode, its zero means nothing."
+        "The frozen reward of an episode, of the new policy trained on it and of the expert of the "
+        "unseen setting; means over seeds, undiscounted, where the training discounts. Short: seeds "
+        "in which the new policy's true return stays more than a fifth below the expert's. Paid "
+        "more: those in which it is paid more nevertheless: the reward ranks a worse policy first. "
+        "Where it is paid less, the training did not find what the reward offers; that does not show "
+        "that the reward is right. One unit is the standard deviation of g on the training data; "
+        "zero means nothing."
     )
-    columns = ["row", "agent", "seeds", "new policy", "expert", "new policy ahead"]
+    columns = ["row", "agent", "seeds", "new policy", "expert", "short", "paid more"]
     return Table("What the learned reward pays", note, columns, lines, heads=2)
 
 

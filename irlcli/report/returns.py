@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from irlcli.descriptions import Evaluation, LearnedReward, Subject
+from irlcli.descriptions import Evaluation, Subject
 from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 
@@ -26,6 +26,7 @@ class Row:
     episodes: int  # per seed
     progress: float | None = None  # mean over seeds; None if the environment reports none
     learned: float | None = None  # mean over seeds of what a learned reward pays per episode
+    policies: int = 1  # one policy under several rewards is no sample of true returns
 
     @property
     def mean(self) -> float:
@@ -34,44 +35,42 @@ class Row:
 
     @property
     def deviation(self) -> float | None:
-        """Standard deviation over seeds; None for one seed."""
-        return statistics.stdev(self.returns) if len(self.returns) > 1 else None
+        """Standard deviation over seeds; None for one policy."""
+        return statistics.stdev(self.returns) if self.policies > 1 else None
 
 
-def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Row]:
+def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> list[Row]:
     """Rows of evaluations, one per agent, method and setting: experts first, random and idle last.
 
     An agent that was measured by another reward than its own is a row for each method of that, its
-    seeds those of the reward.
+    seeds pairs of the policy's and the reward's.
 
     Args:
-        evaluations: ``summary.json``, and the parameters behind it that no seed may change.
+        evaluations: ``summary.json``, the parameters behind it that no seed may change, and
+            whether a reward that it measured by is the policy's own.
 
     Raises:
         UsageError: one seed of the reward learning twice in a row, or seeds that differ in one of
             those parameters.
     """
     made: dict[tuple[int, str, str, str], Mapping[str, Any]] = {}
-    seen: set[tuple] = set()
-    groups: dict[tuple[int, str, str, str], list[tuple]] = {}
-    for summary, parameters in evaluations:
+    groups: dict[tuple[int, str, str, str], dict[tuple, tuple]] = {}
+    for summary, parameters, own in evaluations:
         policy, reward = summary.policy, summary.reward
         order = _ORDER.index(policy.agent)
         for item in summary.settings:
             agent = agent_name(policy, item.setting)
-            seed = policy.seed if policy.reward_seed is None else policy.reward_seed
-            learned_from = policy.reward_settings or policy.settings
-            own = LearnedReward(method=policy.method, seed=seed, settings=learned_from)
-            if reward not in (None, own):
-                agent, seed = f"{agent} on airl-{reward.method}'s reward", reward.seed
+            seeds = [policy.seed if policy.reward_seed is None else policy.reward_seed]
+            if reward is not None and not own:
+                agent += f" on airl-{reward.method}'s reward"
+                seeds.append(reward.seed)
             key = (order, agent, policy.env, item.setting)
             values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
-            if (*key, seed) in seen:
+            if tuple(seeds) in groups.get(key, {}):
                 raise UsageError(
-                    f"{agent} in {item.setting} has seed {seed} twice",
+                    f"{agent} in {item.setting} has seed {' on '.join(map(str, seeds))} twice",
                     "a row's sample is the seed: report runs that differ in anything else apart",
                 )
-            seen.add((*key, seed))
             first = made.setdefault(key, parameters)
             for name in sorted(first | parameters):
                 if first.get(name) != parameters.get(name):
@@ -80,12 +79,13 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any]]]) -> list[Ro
                         f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
                         "a row's sample is the seed: report runs that differ in anything else apart",
                     )
-            groups.setdefault(key, []).append(values)
+            groups.setdefault(key, {})[tuple(seeds)] = values
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):
-        returns, episodes, *others = zip(*items, strict=True)
+        returns, episodes, *others = zip(*items.values(), strict=True)
         means = (None if None in values else statistics.fmean(values) for values in others)
-        found.append(Row(agent, env, setting, returns, min(episodes), *means))
+        policies = len({seed for seed, *_ in items})
+        found.append(Row(agent, env, setting, returns, min(episodes), *means, policies))
     return found
 
 

@@ -29,7 +29,7 @@ class FrozenReward:
         actions: its action space.
 
     Raises:
-        UsageError: the reward takes observations of another size.
+        UsageError: the reward takes other observations or actions.
         IntegrityError: ``path`` is damaged, foreign or hostile.
     """
 
@@ -50,6 +50,15 @@ class FrozenReward:
                 "a goal (goal-y, direction) is part of the observation: name a setting with the "
                 "same kind of intervention as in training",
             )
+        discrete = isinstance(actions, gymnasium.spaces.Discrete)
+        count = int(actions.n) if discrete else actions.shape[0]
+        network = self.origin.network
+        if (network.discrete, network.action_size) != (discrete, count):
+            raise UsageError(
+                f"the reward takes {_actions(network.discrete, network.action_size)}, those of "
+                f"{where} are {_actions(discrete, count)}",
+                "a reward belongs to the environment it was learned in",
+            )
         self._horizon = environment(env).max_episode_steps
         self._absorbing = self.origin.airl.fixed_horizon
         self._actions = SeenActions(self.origin.airl, actions)
@@ -68,3 +77,7 @@ class FrozenReward:
         """
         data = self._actions.of(transitions([trajectory], self._horizon))
         return airl.episode_reward(self._model, data, self._absorbing) / self.origin.scale
+
+
+def _actions(discrete: bool, count: int) -> str:
+    return f"{count} discrete actions" if discrete else f"actions of size {count}"

@@ -236,37 +236,56 @@ def paid(values):
     return results.build(plan, points, {}, {})
 
 
-def test_a_new_policy_that_falls_short_is_the_rewards_fault_or_the_trainings():
+def test_a_new_policy_that_falls_short_is_told_with_what_it_is_paid():
     row = "lunar-lander bounce"
-    report = paid({(row, "erm"): [(4, 1), (5, 1), (9, 10)], (row, "irm"): [(1, 2), (1, 2), (1, 2)]})
+    report = paid({(row, "erm"): [(4, 1), (5, 1), (9, 10)], (row, "irm"): [(1, 2), (1, 1), (1, 2)]})
     assert report.paid.to_dict("records") == [
-        {"row": row, "agent": "erm", "seeds": 3, "policy": 6.0, "expert": 4.0, "more": 2},
-        {"row": row, "agent": "irm", "seeds": 3, "policy": 1.0, "expert": 2.0, "more": 0},
+        {
+            **{"row": row, "agent": agent, "seeds": 3, "policy": policy, "expert": expert},
+            **{"short": 3, "short_paid_more": more},
+        }
+        for agent, policy, expert, more in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 0))
     ]
     short = [note for note in report.notes if note.startswith("Short of the expert")]
-    assert short == [
-        f"Short of the expert: {row}, AIRL-ERM: the new policies earn 6.0 of their reward an "
-        "episode, the setting's expert 4.0. In 2 of 3 seeds the reward prefers the new policy: it "
-        "is wrong here, in 1 of 3 seeds the expert: there the training fell short.",
-        f"Short of the expert: {row}, AIRL-IRM: the new policies earn 1.0 of their reward an "
-        "episode, the setting's expert 2.0. In 3 of 3 seeds the expert: there the training fell "
-        "short.",
+    assert [note.split("the setting's")[0] for note in short] == [
+        f"Short of the expert: {row}, AIRL-{agent}: 3 of 3 new policies. {more} of them are paid "
+        "more of their learned reward than "
+        for agent, more in (("ERM", 2), ("IRM", 0))
     ]
     (table,) = (t for t in report.tables if t.title == "What the learned reward pays")
-    assert [line[-1] for line in table.rows] == ["2/3", "0/3"]
+    assert [line[2:] for line in table.rows] == [
+        ["3", "6.0", "4.0", "3/3", "2/3"],
+        ["3", "1.0", "1.7", "3/3", "0/3"],
+    ]
     # The expert's returns under the rewards are in no cell.
     assert set(report.cells["measure"]) == {"ood", "id", "transfer", "zero-shot"}
 
 
 def test_a_new_policy_as_good_as_the_expert_needs_no_excuse():
     row = "lunar-lander bounce"
-    whole = full() | {(row, "erm", "transfer"): [240.0, 250.0, 260.0]}
-    whole[row, "erm", results.EXPERT_PAID] = [250.0] * 3
+    for returns, short in (([240.0, 250.0, 260.0], 0), ([280.0, 0.0, 0.0], 2)):
+        whole = full() | {(row, "erm", "transfer"): returns}
+        whole[row, "erm", results.EXPERT_PAID] = [250.0] * 3
+        plan, points = made(whole)
+        # The first seed is paid more: that counts only if it falls short.
+        paid_more = (points["measure"] == "transfer") & (points["seed"] == 0)
+        points["learned_return"] = paid_more.astype(float)
+        report = results.build(plan, points, {}, {})
+        assert [(r.agent, r.short, r.short_paid_more) for r in report.paid.itertuples()] == [
+            ("erm", short, 0)
+        ]
+        assert any(note.startswith("Short of") for note in report.notes) == (short > 0)
+
+
+def test_seeds_without_both_evaluations_are_left_out_of_what_is_paid():
+    row = "lunar-lander bounce"
+    whole = full()
+    whole[row, "erm", results.EXPERT_PAID] = [250.0, None, 250.0]
     plan, points = made(whole)
-    points["learned_return"] = 1.0
+    points["learned_return"] = 2.0
+    points.loc[(points["measure"] == "transfer") & (points["seed"] == 0), "learned_return"] = None
     report = results.build(plan, points, {}, {})
-    assert list(report.paid["agent"]) == ["erm"]
-    assert not any(note.startswith("Short of") for note in report.notes)
+    assert [(r.agent, r.seeds) for r in report.paid.itertuples()] == [("erm", 1)]
 
 
 def test_a_share_of_nothing_is_no_number():

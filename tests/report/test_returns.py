@@ -13,7 +13,7 @@ def evaluation(agent, mean, seed=None, made=None, **subject):
         policy=Subject(agent=agent, env="lunar-lander", seed=seed, **subject),
         settings=(Returns(setting="bounce=0.9", episodes=20, mean_return=mean),),
     )
-    return summary, made or {}
+    return summary, made or {}, False
 
 
 def test_statistics_are_over_seeds():
@@ -59,44 +59,46 @@ def test_a_student_is_zero_shot_only_where_no_one_showed_it_anything():
             for value in ("-5", "-10..0", "-10..10", "10")
         ),
     )
-    found = {row.setting: row.agent for row in rows([(turned, {})])}
+    found = {row.setting: row.agent for row in rows([(turned, {}, False)])}
     assert [found[f"direction={v}"].split()[1] for v in ("-5", "-10..0")] == ["in", "in"]
     assert [found[f"direction={v}"].split()[1] for v in ("-10..10", "10")] == ["zero-shot"] * 2
 
 
 def test_what_another_reward_pays_is_a_row_of_its_own():
-    trained_in = ("bounce=0.1",)
-
-    def by_reward(agent, seed, learned, **subject):
-        summary, made = evaluation(agent, 5.0, 0, **subject)
+    def by_reward(agent, learned, seed, own=False, **subject):
+        summary, made, _ = evaluation(agent, 5.0, subject.pop("policy_seed", 0), **subject)
         (place,) = summary.settings
-        return msgspec.structs.replace(
+        summary = msgspec.structs.replace(
             summary,
-            reward=LearnedReward(method="irm", seed=seed, settings=trained_in),
+            reward=LearnedReward(method="irm", seed=seed, settings=("bounce=0.1",)),
             settings=(msgspec.structs.replace(place, mean_learned_return=learned),),
-        ), made
+        )
+        return summary, made, own
 
-    own = {"method": "irm", "reward_settings": trained_in}
+    irm = {"method": "irm"}
     found = rows(
         [
-            *(by_reward("expert", seed, learned) for seed, learned in ((0, -2.0), (1, -4.0))),
-            by_reward("transfer", 1, 7.0, reward_seed=1, **own),
-            by_reward("transfer", 2, 9.0, reward_seed=1, **own),
-            by_reward(
-                "transfer", 3, 8.0, reward_seed=3, method="irm", reward_settings=("bounce=0",)
-            ),
-            by_reward("student", 0, 6.0, method="irm", settings=trained_in),
+            *(by_reward("expert", learned, seed) for seed, learned in ((0, -2.0), (1, -4.0))),
+            by_reward("transfer", 7.0, 1, own=True, reward_seed=1, **irm),
+            # The same method, settings and seed, but another reward: another lambda, say.
+            by_reward("transfer", 9.0, 1, reward_seed=1, **irm),
+            by_reward("transfer", 8.0, 1, reward_seed=2, **irm),
+            by_reward("student", 6.0, 0, own=True, settings=("bounce=0.1",), **irm),
             evaluation("idle", 1.0),
         ]
     )
     other = "on airl-irm's reward"
-    assert {row.agent: (row.learned, len(row.returns)) for row in found} == {
-        f"expert {other}": (-3.0, 2),
-        "airl-irm zero-shot": (6.0, 1),
-        "airl-irm transfer": (7.0, 1),
-        f"airl-irm transfer {other}": (8.5, 2),
-        "idle": (None, 1),
+    assert {row.agent: (row.learned, len(row.returns), row.deviation) for row in found} == {
+        # One expert under two rewards is no sample of true returns.
+        f"expert {other}": (-3.0, 2, None),
+        "airl-irm zero-shot": (6.0, 1, None),
+        "airl-irm transfer": (7.0, 1, None),
+        f"airl-irm transfer {other}": (8.5, 2, 0.0),
+        "idle": (None, 1, None),
     }
+    twice = [by_reward("expert", 1.0, 4) for _ in range(2)]
+    with pytest.raises(UsageError, match=r"reward in bounce=0\.9 has seed 0 on 4 twice"):
+        rows(twice)
 
 
 def test_a_seed_that_comes_twice_is_refused():

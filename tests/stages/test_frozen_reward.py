@@ -1,18 +1,24 @@
 """What a learned reward pays, against the same network written out in numpy."""
 
 import json
+import math
+import re
 
 import gymnasium
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from irlcli import rl
+from irlcli import checkpoints, descriptions, rl
 from irlcli.checkpoints import load_policy_file
-from irlcli.errors import UsageError
+from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import environment, parse_setting
+from irlcli.irl.networks import RewardModel
+from irlcli.settings import AIRLSettings
 from irlcli.stages.frozen_reward import FrozenReward
+from irlcli.trajectories import Trajectory
 
 
 def by_hand(path, about):
@@ -87,8 +93,109 @@ def test_evaluate_says_what_the_reward_pays(irl, store_copy, agent):
     assert ("of train-airl" in line) == (agent == "policy")
 
 
-def test_observations_of_another_size_are_refused(smoke_store):
+def test_another_lambdas_reward_is_not_the_policys_own(irl, store_copy):
+    common = ["--store", store_copy.path, "--profile", "smoke"]
+    learn = ["train-airl", "--demos", "demos", "--method", "irm", "--penalty-weight", "7"]
+    assert irl(*learn, "--name", "other", *common).code == 0
+    agents = {}
+    for reward in ("airl", "other"):
+        named = ["--reward", reward, "--name", f"by-{reward}"]
+        done = irl("evaluate", "--policy", "moved", "--ood", "1.5x", *named, *common)
+        assert done.code == 0, done.err
+        shown = irl("report", "returns", f"by-{reward}", "--json", "--store", store_copy.path).out
+        (row,) = json.loads(shown)["rows"]
+        agents[reward] = row["agent"]
+        assert f"\n{row['agent']}  " in done.err
+        assert isinstance(row["mean_learned_return"], float)
+    assert agents == {
+        "airl": "airl-irm transfer",
+        "other": "airl-irm transfer on airl-irm's reward",
+    }
+    student = irl("evaluate", "--policy", "airl", "--ood", "1.5x", "--reward", "other", *common)
+    assert "airl-irm zero-shot on airl-irm's reward" in student.err
+    own = irl("evaluate", "--policy", "airl", "--ood", "1.5x", "--reward", "airl", *common)
+    assert "airl-irm zero-shot  " in own.err
+    # Experts under two rewards that differ in lambda are no row.
+    for seed, reward in enumerate(("airl", "other")):
+        named = ["--ood", "1.5x", "--reward", reward, "--name", f"expert-{seed}"]
+        assert irl("evaluate", "--expert", *named, "--env", "lunar-lander", *common).code == 0
+    mixed = irl("report", "returns", "expert-0", "expert-1", "--store", store_copy.path)
+    assert mixed.code == 2
+    assert re.search(
+        r"differ in reward\.train-airl\.airl\.penalty_weight|seed 0 on 0 twice", mixed.err
+    )
+    # One evaluation with the reward and one without differ in nothing that makes a return.
+    with_it, without = (
+        irl("report", "returns", n, "--store", store_copy.path).out for n in ("by-airl", "score")
+    )
+    assert with_it.split()[-1] == without.split()[-1]
+
+
+def test_the_experts_of_other_settings_can_be_measured_by_a_reward(irl, store_copy):
+    done = irl(
+        *["evaluate", "--expert", "--trained-in", "engine-power=1x", "--ood", "1.25x,1x"],
+        *["--reward", "airl", "--store", store_copy.path, "--profile", "smoke"],
+    )
+    assert done.code == 0, done.err
+    assert "expert of engine-power=1x on airl-irm's reward" in done.err
+
+
+def continuous(path, actions, numbers=None):
+    """A reward of one observation and one bounded action, g(s, a) = 2 s + 3 a; its scale is 2."""
+    network = descriptions.RewardNetwork(
+        observation_size=1,
+        action_size=1,
+        discrete=False,
+        state_only=False,
+        hidden=(),
+        activation="tanh",
+        gamma=0.9,
+    )
+    settings = AIRLSettings(method="erm", actions=actions, fixed_horizon=False)
+    about = descriptions.Reward(
+        env="ant",
+        settings=("mass=2x",),
+        method="erm",
+        seed=0,
+        airl=settings,
+        network=network,
+        scale=2.0,
+    )
+    model = RewardModel(**msgspec.to_builtins(network))
+    state = {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
+    state["normaliser.variance"] += 1.0
+    state["g.0.weight"] = torch.tensor(numbers or [[2.0, 3.0]])
+    checkpoints.save(path, "reward", about, state)
+
+
+@pytest.mark.parametrize(("actions", "second"), [("executed", 1.0), ("sampled", 5.0)])
+def test_actions_are_clipped_where_the_reward_saw_them_so(tmp_path, actions, second):
+    continuous(tmp_path / "reward.pt", actions)
+    box = gymnasium.spaces.Box(-1, 1, (1,))
+    reward = FrozenReward(tmp_path / "reward.pt", "ant", "ant", box, box)
+    episode = Trajectory(
+        observations=np.array([[1.0], [2.0], [50.0]], np.float32),
+        actions=np.array([[-1.0], [5.0]], np.float32),
+        rewards=np.zeros(2),
+        terminated=True,
+        truncated=False,
+        seed=0,
+    )
+    # Without absorbing states the last observation earns nothing.
+    expected = (2 * 1.0 + 3 * -1.0 + 2 * 2.0 + 3 * second) / 2.0
+    assert reward.of_episode(episode) == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_the_reward_cannot_measure_is_refused(tmp_path, smoke_store):
     path = smoke_store.path / smoke_store.airl / "reward.pt"
-    wide = gymnasium.spaces.Box(-1, 1, (9,))
-    with pytest.raises(UsageError, match="size 8, those of lunar-lander x have size 9"):
-        FrozenReward(path, "lunar-lander", "lunar-lander x", wide, gymnasium.spaces.Discrete(4))
+    box, four = gymnasium.spaces.Box(-1, 1, (8,)), gymnasium.spaces.Discrete(4)
+    for observations, actions, message in (
+        (gymnasium.spaces.Box(-1, 1, (9,)), four, "size 8, those of x have size 9"),
+        (box, gymnasium.spaces.Discrete(2), "takes 4 discrete actions, those of x are 2 discrete"),
+        (box, box, "takes 4 discrete actions, those of x are actions of size 8"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            FrozenReward(path, "lunar-lander", "x", observations, actions)
+    continuous(tmp_path / "reward.pt", "executed", [[2.0, math.nan]])
+    with pytest.raises(IntegrityError, match="not finite"):
+        FrozenReward(tmp_path / "reward.pt", "ant", "x", box, box)
