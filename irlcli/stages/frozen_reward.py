@@ -19,7 +19,7 @@ from irlcli.trajectories import Trajectory, transitions
 
 
 class FrozenReward:
-    """g divided by its standard deviation on training data, so that rewards can be compared.
+    """g divided by its standard deviation on training data; nothing is centred.
 
     Args:
         path: a ``reward.pt``.
