@@ -323,12 +323,11 @@ def _not_imitated(cells: pd.DataFrame) -> list[str]:
 
 
 def _short(paid: pd.DataFrame) -> list[str]:
-    """Where new policies fall short of the expert: whether their reward says so too."""
+    """New policies that fall short of the expert, and whether their reward ranks them so too."""
     return [
-        f"Short of the expert: {r.row}, {TITLES[r.agent]}: {r.short} of {r.seeds} new policies. "
-        f"{r.short_paid_more} of them are paid more of their learned reward than the setting's expert "
-        "would be, so that the reward does not lead to it; the others less, so that they do not "
-        "earn what it offers either."
+        f"Short of the expert: {r.row}, {TITLES[r.agent]}: {r.short} of {r.seeds} new policies. The "
+        f"learned reward pays {r.short_paid_more} of them more than it would pay the setting's expert, "
+        f"{r.short - r.short_paid_more} less."
         for r in paid.itertuples()
         if r.short
     ]

@@ -247,9 +247,9 @@ def test_a_new_policy_that_falls_short_is_told_with_what_it_is_paid():
         for agent, policy, expert, more in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 0))
     ]
     short = [note for note in report.notes if note.startswith("Short of the expert")]
-    assert [note.split("the setting's")[0] for note in short] == [
-        f"Short of the expert: {row}, AIRL-{agent}: 3 of 3 new policies. {more} of them are paid "
-        "more of their learned reward than "
+    assert short == [
+        f"Short of the expert: {row}, AIRL-{agent}: 3 of 3 new policies. The learned reward pays "
+        f"{more} of them more than it would pay the setting's expert, {3 - more} less."
         for agent, more in (("ERM", 2), ("IRM", 0))
     ]
     (table,) = (t for t in report.tables if t.title == "What the learned reward pays")
