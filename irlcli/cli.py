@@ -556,7 +556,8 @@ def _evaluate_agent(session, agent, trained_in, where, env, episodes, seed, lear
     if env is None or where[0] is None:
         missing = "--env ENV " if env is None else ""
         raise UsageError(
-            f"--{agent} does not say where", f"add {missing}--intervention KNOB=VALUE,VALUE"
+            f"--{agent} does not say where",
+            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood",
         )
     config = session.settings(env, {"evaluation.episodes": episodes})
     settings = _settings(env, config, *where, origin)

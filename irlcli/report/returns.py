@@ -68,7 +68,7 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
             values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
             if tuple(seeds) in groups.get(key, {}):
                 raise UsageError(
-                    f"{agent} in {item.setting} has seed {' on '.join(map(str, seeds))} twice",
+                    f"{agent} in {item.setting} has seed {' under the reward of seed '.join(map(str, seeds))} twice",
                     "a row's sample is the seed: report runs that differ in anything else apart",
                 )
             first = made.setdefault(key, parameters)

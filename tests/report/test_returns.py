@@ -97,7 +97,9 @@ def test_what_another_reward_pays_is_a_row_of_its_own():
         "idle": (None, 1, None),
     }
     twice = [by_reward("expert", 1.0, 4) for _ in range(2)]
-    with pytest.raises(UsageError, match=r"reward in bounce=0\.9 has seed 0 on 4 twice"):
+    with pytest.raises(
+        UsageError, match=r"reward in bounce=0\.9 has seed 0 under the reward of seed 4 twice"
+    ):
         rows(twice)
 
 

@@ -122,7 +122,8 @@ def test_another_lambdas_reward_is_not_the_policys_own(irl, store_copy):
     mixed = irl("report", "returns", "expert-0", "expert-1", "--store", store_copy.path)
     assert mixed.code == 2
     assert re.search(
-        r"differ in reward\.train-airl\.airl\.penalty_weight|seed 0 on 0 twice", mixed.err
+        r"differ in reward\.train-airl\.airl\.penalty_weight|seed 0 under the reward of seed 0 twice",
+        mixed.err,
     )
     # One evaluation with the reward and one without differ in nothing that makes a return.
     with_it, without = (
