@@ -18,11 +18,11 @@ import gymnasium
 import numpy as np
 import torch
 
-from irlcli import rl
-from irlcli.dataset import Demonstrations
+from irlcli.configs import load_config
+from irlcli.data.demonstrations import Demonstrations
 from irlcli.interventions import parse_settings
-from irlcli.settings import load_settings
-from irlcli.stages.adversary import Adversary
+from irlcli.learners.adversary import Adversary
+from irlcli.rl import ppo as rl
 
 INTERVENTIONS = {
     "lunar-lander": "engine-power=1x,1.25x",
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--intervention", help="KNOB=VALUE,... in place of the usual one")
     arguments = parser.parse_args()
-    config = load_settings(arguments.env, arguments.profile).airl
+    config = load_config(arguments.env, arguments.profile).airl
     settings = parse_settings(arguments.env, arguments.intervention or INTERVENTIONS[arguments.env])
 
     bare = rl.make_worlds(arguments.env, settings, config.ppo.n_envs)

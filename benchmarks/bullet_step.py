@@ -23,9 +23,9 @@ WORLDS = ("ant", "half-cheetah", "reacher")
 
 def make(name: str):
     """The environment called ``name``, the original model if it ends in ``-original``."""
-    from irlcli.envs.bullet.ant import Ant
-    from irlcli.envs.bullet.half_cheetah import HalfCheetah
-    from irlcli.envs.bullet.reacher import Reacher
+    from irlcli.envs.ant.env import Ant
+    from irlcli.envs.half_cheetah.env import HalfCheetah
+    from irlcli.envs.reacher.env import Reacher
 
     robots = {"ant": Ant, "half-cheetah": HalfCheetah, "reacher": Reacher}
     robot = robots[name.removesuffix("-original")]

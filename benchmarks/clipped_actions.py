@@ -17,13 +17,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from irlcli import envs, references
-from irlcli.checkpoints import load_policy_file
-from irlcli.dataset import read_demonstrations
+from irlcli.configs import AIRLConfig
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.tensors import load_policy_file
+from irlcli.envs import registration as envs
+from irlcli.envs.registry import environment
 from irlcli.errors import IrlError
-from irlcli.interventions import environment, parse_setting
-from irlcli.settings import AIRLSettings
-from irlcli.stages.actions import SeenActions
+from irlcli.experiments import references
+from irlcli.interventions import parse_setting
+from irlcli.learners.actions import SeenActions
 from irlcli.store import Store
 from irlcli.trajectories import transitions
 
@@ -43,7 +45,7 @@ def main(demonstrations: str, learned: str) -> None:
         size = np.abs(data.actions) / space.high
         own = replace(data, actions=policy.act(data.observations))
         for kind in ("sampled", "executed"):
-            seen = SeenActions(AIRLSettings(actions=kind), space)
+            seen = SeenActions(AIRLConfig(actions=kind), space)
             theirs, its = (
                 float(seen.log_prob(policy, seen.of(d)).double().mean()) for d in (data, own)
             )

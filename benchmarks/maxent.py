@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 from scipy.special import logsumexp
 
-from irlcli.envs.gridworld import gridworld
-from irlcli.irl.maxent import solve
+from irlcli.envs.gridworld.env import gridworld
+from irlcli.learners.maxent import solve
 from irlcli.tabular import dense_transitions, stack
 
 SIZE, HORIZON, RUNS = 32, 128, 20

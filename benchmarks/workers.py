@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from irlcli import envs
+from irlcli.envs import registration as envs
 from irlcli.envs.workers import WorkerWorlds
 from irlcli.interventions import parse_setting
 

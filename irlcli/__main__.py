@@ -1,5 +1,5 @@
 """``python -m irlcli`` is ``irl``."""
 
-from irlcli.cli import main
+from irlcli.cli.main import main
 
 main()

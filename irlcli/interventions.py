@@ -11,21 +11,21 @@ Grammar, per comma-separated value: ``2x`` multiplies the default, ``0.5`` is ab
 import math
 import re
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
+from irlcli.envs.registry import ENVIRONMENTS, environment
+from irlcli.envs.spec import Form, Knob
 from irlcli.errors import UsageError, suggest
-
-Kind = Literal["multiplier", "absolute", "triple", "range"]
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 # Compiled when used: every command imports this module.
-_FORMS: dict[Kind, str] = {
+_FORMS: dict[Form, str] = {
     "multiplier": rf"({_NUMBER})x",
     "absolute": rf"({_NUMBER})",
     "triple": rf"({_NUMBER}):({_NUMBER}):({_NUMBER})",
     "range": rf"({_NUMBER})\.\.({_NUMBER})",
 }
-_EXAMPLES: dict[Kind, str] = {
+_EXAMPLES: dict[Form, str] = {
     "multiplier": "2x",
     "absolute": "0.5",
     "triple": "1.5:0.1:0.1",
@@ -36,12 +36,12 @@ _EXAMPLES: dict[Kind, str] = {
 class Value(NamedTuple):
     """One intervention value: its form and its one, two or three numbers."""
 
-    kind: Kind
+    form: Form
     numbers: tuple[float, ...]
 
     def __str__(self) -> str:
         text = [_format(x) for x in self.numbers]
-        match self.kind:
+        match self.form:
             case "multiplier":
                 return f"{text[0]}x"
             case "triple":
@@ -55,118 +55,6 @@ class Value(NamedTuple):
     def argument(self) -> float | tuple[float, ...]:
         """What the environment's keyword argument receives."""
         return self.numbers[0] if len(self.numbers) == 1 else self.numbers
-
-
-class Knob(NamedTuple):
-    """One mechanism of an environment that can be intervened on.
-
-    ``low`` and ``high`` bound every number of a value (inclusive); ``kinds`` are the forms
-    it accepts, the first being the usual one. ``whole`` admits whole numbers only. ``observed``:
-    what is set becomes part of the observation.
-    """
-
-    argument: str
-    kinds: tuple[Kind, ...]
-    low: float
-    high: float
-    what: str
-    whole: bool = False
-    observed: bool = False
-
-
-class Environment(NamedTuple):
-    """What the program knows of an environment without importing it.
-
-    ``tabular``: solved exactly; experts come from value iteration, rewards from train-maxent.
-    ``physics`` counts the changes that altered what happens in it: part of every artefact's key.
-    """
-
-    name: str
-    gym_id: str
-    max_episode_steps: int
-    knobs: dict[str, Knob]
-    tabular: bool = False
-    physics: int = 1
-
-
-_FRICTION = "tangential, torsional and rolling friction of the robot's links"
-_WALKER_KNOBS = {
-    "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "mass of every link"),
-    "goal-y": Knob(
-        "goal_y",
-        ("absolute",),
-        -10000.0,
-        10000.0,
-        "the goal is at (1000, goal-y) m",
-        observed=True,
-    ),
-    "direction": Knob(
-        "direction",
-        ("absolute", "range"),
-        -180.0,
-        180.0,
-        "of the goal, degrees from ahead",
-        observed=True,
-    ),
-}
-
-ENVIRONMENTS: dict[str, Environment] = {
-    "lunar-lander": Environment(
-        name="lunar-lander",
-        gym_id="irlcli/LunarLander-v0",
-        max_episode_steps=1000,
-        knobs={
-            "bounce": Knob("bounce", ("absolute",), 0.0, 1.0, "restitution of hull and legs"),
-            "friction": Knob("friction", ("absolute",), 0.0, 10.0, "friction of the moon"),
-            "engine-power": Knob(
-                "engine_power", ("multiplier",), 0.05, 20.0, "power of the main engine"
-            ),
-        },
-    ),
-    "ant": Environment(
-        name="ant",
-        gym_id="irlcli/Ant-v0",
-        max_episode_steps=1000,
-        knobs={
-            **_WALKER_KNOBS,
-            "friction": Knob("friction", ("triple",), 0.0, 10.0, _FRICTION),
-            "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
-        },
-    ),
-    "half-cheetah": Environment(
-        name="half-cheetah",
-        gym_id="irlcli/HalfCheetah-v0",
-        max_episode_steps=1000,
-        knobs={
-            **_WALKER_KNOBS,
-            "friction": Knob("friction", ("triple",), 0.0, 10.0, _FRICTION),
-            "leg-length": Knob(
-                "leg_length", ("absolute", "multiplier"), 0.2, 5.0, "length of both legs"
-            ),
-        },
-    ),
-    "reacher": Environment(
-        name="reacher",
-        gym_id="irlcli/Reacher-v0",
-        max_episode_steps=150,
-        knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "of 9.8 m/s^2")},
-        physics=2,
-    ),
-    "gridworld": Environment(
-        name="gridworld",
-        gym_id="irlcli/Gridworld-v0",
-        max_episode_steps=32,
-        knobs={
-            "path-group": Knob(
-                "path_group", ("absolute",), 0, 3, "the open gate, 0 for no gates", whole=True
-            ),
-            "blocked": Knob(
-                "blocked", ("absolute",), 0, 2, "how many groups' paths are barred", whole=True
-            ),
-        },
-        tabular=True,
-    ),
-}
 
 
 class Setting(NamedTuple):
@@ -183,17 +71,6 @@ def _format(x: float) -> str:
     """Shortest text that reads back as ``x``; 2.0 is ``2``, and -0.0 is ``0``."""
     x = x + 0.0
     return str(int(x)) if x.is_integer() and abs(x) < 1e15 else repr(x)
-
-
-def environment(name: str) -> Environment:
-    """The environment called ``name``.
-
-    Raises:
-        UsageError: no such environment.
-    """
-    if name not in ENVIRONMENTS:
-        raise UsageError(f"unknown environment {name!r}", suggest(name, ENVIRONMENTS))
-    return ENVIRONMENTS[name]
 
 
 def check_tabular(env: str, stage: str, wanted: bool) -> None:
@@ -259,19 +136,19 @@ def parse_value(env: str, knob: str, text: str) -> Value:
         UsageError: not a number of an allowed form, not finite, or out of range.
     """
     spec = knob_of(env, knob)
-    examples = " or ".join(_EXAMPLES[kind] for kind in spec.kinds)
-    for kind, form in _FORMS.items():
-        match = re.fullmatch(form, text.strip())
+    examples = " or ".join(_EXAMPLES[form] for form in spec.forms)
+    for form, pattern in _FORMS.items():
+        match = re.fullmatch(pattern, text.strip())
         if match is None:
             continue
-        if kind not in spec.kinds:
+        if form not in spec.forms:
             raise UsageError(
-                f"{knob}={text.strip()!r}: {env} takes {knob} as {' or '.join(spec.kinds)}, "
-                f"not as {kind}",
+                f"{knob}={text.strip()!r}: {env} takes {knob} as {' or '.join(spec.forms)}, "
+                f"not as {form}",
                 f"write it like {knob}={examples}",
             )
         numbers = tuple(float(group) + 0.0 for group in match.groups())
-        if kind == "range" and numbers[0] > numbers[1]:
+        if form == "range" and numbers[0] > numbers[1]:
             raise UsageError(
                 f"{knob}={text.strip()!r}: the range is empty",
                 f"write the smaller end first: {_format(numbers[1])}..{_format(numbers[0])}",
@@ -279,15 +156,15 @@ def parse_value(env: str, knob: str, text: str) -> Value:
         if spec.whole and not all(x.is_integer() for x in numbers):
             raise UsageError(
                 f"{knob}={text.strip()!r} is no whole number",
-                f"{knob} ({spec.what}) is one of {_format(spec.low)} to {_format(spec.high)}",
+                f"{knob} ({spec.description}) is one of {_format(spec.low)} to {_format(spec.high)}",
             )
         for x in numbers:
             if not math.isfinite(x) or not spec.low <= x <= spec.high:
                 raise UsageError(
                     f"{knob}={text.strip()!r} is out of range",
-                    f"{knob} ({spec.what}) lies in {_format(spec.low)} to {_format(spec.high)}",
+                    f"{knob} ({spec.description}) lies in {_format(spec.low)} to {_format(spec.high)}",
                 )
-        return Value(kind, numbers)
+        return Value(form, numbers)
     raise UsageError(
         f"{knob}={text.strip()!r} is no intervention value", f"write it like {knob}={examples}"
     )
@@ -322,13 +199,13 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
 
 def world(setting: Setting) -> tuple[float, ...]:
     """Equal for values of a knob that make one world, however written: 10 and 10..10."""
-    kind, numbers = setting.value or ("absolute", ())
-    return numbers[:1] if kind == "range" and numbers[0] == numbers[1] else numbers
+    form, numbers = setting.value or ("absolute", ())
+    return numbers[:1] if form == "range" and numbers[0] == numbers[1] else numbers
 
 
 def covers(wide: Setting, narrow: Setting) -> bool:
     """Whether every world of ``narrow`` is one of ``wide``, as -5 and -5..0 are of -10..0."""
-    if wide.knob != narrow.knob or wide.value is None or wide.value.kind != "range":
+    if wide.knob != narrow.knob or wide.value is None or wide.value.form != "range":
         return wide.knob == narrow.knob and world(wide) == world(narrow)
     low, high = wide.value.numbers
     return all(low <= number <= high for number in world(narrow))
@@ -338,7 +215,7 @@ def overlap(one: Setting, other: Setting) -> bool:
     """Whether they share worlds: one covers the other, or two ranges meet in more than an end."""
     if covers(one, other) or covers(other, one):
         return True
-    if not all(s.value is not None and s.value.kind == "range" for s in (one, other)):
+    if not all(s.value is not None and s.value.form == "range" for s in (one, other)):
         return False
     return max(world(one)[0], world(other)[0]) < min(world(one)[-1], world(other)[-1])
 

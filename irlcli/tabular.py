@@ -122,7 +122,7 @@ def shortest_path_length(mdp: TabularMDP) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
+class StackedMDPs:
     """E MDPs of one shape, as one block-diagonal sparse MDP over E * S states.
 
     Made by :func:`stack`. ``spread`` [E*X, E*S] takes values of states to values of afterstates;
@@ -145,7 +145,7 @@ class Settings:
         return len(self.mdps), self.mdps[0].n_states, self.mdps[0].n_actions
 
 
-def stack(mdps: Sequence[TabularMDP]) -> Settings:
+def stack(mdps: Sequence[TabularMDP]) -> StackedMDPs:
     """Put ``mdps`` side by side.
 
     Raises:
@@ -169,7 +169,7 @@ def stack(mdps: Sequence[TabularMDP]) -> Settings:
         (np.ones(afterstate.size), (afterstate.ravel(), np.arange(afterstate.size))),
         shape=(len(mdps) * x, afterstate.size),
     )
-    return Settings(
+    return StackedMDPs(
         mdps=tuple(mdps),
         afterstate=afterstate,
         spread=spread,
@@ -195,7 +195,7 @@ def hard_backup(action_values: np.ndarray) -> np.ndarray:
 
 
 def backward(
-    settings: Settings, reward: np.ndarray, horizon: int, backup: Backup, discount: float = 1.0
+    settings: StackedMDPs, reward: np.ndarray, horizon: int, backup: Backup, discount: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Finite-horizon dynamic programming: V_H = r, Q_t = gamma E[V_{t+1}], V_t = r + backup(Q_t).
 
@@ -228,7 +228,7 @@ def backward(
 
 
 def forward(
-    settings: Settings, policy: np.ndarray, discount: float = 1.0
+    settings: StackedMDPs, policy: np.ndarray, discount: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """State distributions under ``policy`` [H, A, E, S, R], as :func:`backward` returns it.
 
@@ -257,7 +257,7 @@ class Evaluation:
     true_return: np.ndarray  # undiscounted, as the environment pays it: for s_0 .. s_{H-1}
 
 
-def evaluate(settings: Settings, policy: np.ndarray) -> Evaluation:
+def evaluate(settings: StackedMDPs, policy: np.ndarray) -> Evaluation:
     """Exact evaluation of ``policy`` [H, A, E, S, R] by the true reward of each setting.
 
     The goal must keep whoever reaches it, or end the episode.
@@ -272,7 +272,7 @@ def evaluate(settings: Settings, policy: np.ndarray) -> Evaluation:
 
 
 def optimal_policy(
-    settings: Settings, reward: np.ndarray, horizon: int
+    settings: StackedMDPs, reward: np.ndarray, horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Value iteration over ``horizon`` steps: policy [H, A, E, S, R], uniform over ties, and V_0.
 
@@ -292,12 +292,12 @@ def optimal_policy(
     return backward(settings, reward, horizon, hard_backup)
 
 
-def true_reward(settings: Settings) -> np.ndarray:
+def true_reward(settings: StackedMDPs) -> np.ndarray:
     """[1, E, S]: the true rewards, as :func:`backward` takes them."""
     return np.stack([m.reward for m in settings.mdps])[None]
 
 
-def columns(settings: Settings, array: np.ndarray) -> np.ndarray:
+def columns(settings: StackedMDPs, array: np.ndarray) -> np.ndarray:
     """[R, S] or [R, E, S] as [E * S, R], or as [E * S] if R = 1: half the time of one column.
 
     Raises:
@@ -316,7 +316,7 @@ def columns(settings: Settings, array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array.reshape(-1, e * n).T)
 
 
-def runs_first(settings: Settings, array: np.ndarray) -> np.ndarray:
+def runs_first(settings: StackedMDPs, array: np.ndarray) -> np.ndarray:
     """[E * S, R] or [E * S] as [R, E, S]."""
     e, n, _ = settings.shape
     return np.ascontiguousarray(array.reshape(e * n, -1).T).reshape(-1, e, n)

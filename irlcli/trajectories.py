@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -125,3 +126,73 @@ def join(parts: Sequence[Transitions]) -> Transitions:
     return Transitions(
         *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Transitions))
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """T steps of N worlds, time first. ``s`` is ``observations``, ``s'`` ``next_observations``.
+
+    A world's setting is its position: equal shares, setting-major (see :func:`world_settings`).
+
+    Attributes:
+        observations: [T, N, D] float32.
+        actions: [T, N] int64 or [T, N, A] float32: the policy's samples. The environment clips
+            those outside the action space.
+        next_observations: [T, N, D] float32; where an episode ended, its final observation and
+            not the first one of the next episode.
+        log_probs: [T, N] float32, log pi(a|s) of the sampling policy.
+        true_rewards: [T, N] float64.
+        terminated, truncated: [T, N] bool.
+        lengths: [T, N] int64, length of the episode that ended here, else 0.
+        returns: [T, N] float64, true return of that episode.
+        progress: [T, N] float64, progress of that episode; NaN if the environment reports none.
+        errors: (world, message) of each episode that had to be ended.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    next_observations: np.ndarray
+    log_probs: np.ndarray
+    true_rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    lengths: np.ndarray
+    returns: np.ndarray
+    progress: np.ndarray
+    errors: tuple[tuple[int, str], ...]
+
+    def transitions(self, worlds: np.ndarray | slice, horizon: int) -> Transitions:
+        """The transitions [T * n] of some of the worlds, time-major."""
+
+        def flat(array: np.ndarray) -> np.ndarray:
+            chosen = array[:, worlds]
+            return chosen.reshape(-1, *chosen.shape[2:])
+
+        terminated = flat(self.terminated)
+        return Transitions(
+            observations=flat(self.observations),
+            actions=flat(self.actions),
+            next_observations=flat(self.next_observations),
+            terminated=terminated,
+            remaining=np.where(terminated, horizon - flat(self.lengths), 0),
+        )
+
+
+def world_settings(worlds: int, settings: int) -> np.ndarray:
+    """Index [worlds] of each world's setting: equal shares, setting-major."""
+    return np.arange(worlds) * settings // worlds
+
+
+class ActionSpace(NamedTuple):
+    """The actions of an environment.
+
+    Attributes:
+        discrete: whether an action is an index.
+        size: number of actions if discrete, else the length A of an action vector.
+        low, high: bounds [A] float32 of continuous actions; empty if discrete.
+    """
+
+    discrete: bool
+    size: int
+    low: np.ndarray
+    high: np.ndarray

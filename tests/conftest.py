@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import pytest
 from hypothesis import settings
 
-from irlcli import cli as command_line
+from irlcli.cli import main as command_line
 from irlcli.store import KeyRecord, Published, Store
 
 # A shell that starts the tests in the background makes them, and their children, deaf to it.

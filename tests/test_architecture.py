@@ -121,7 +121,7 @@ def loaded_by(*arguments):
     code = (
         "import sys\n"
         f"sys.argv = ['irl', *{list(arguments)!r}]\n"
-        "from irlcli.cli import main\n"
+        "from irlcli.cli.main import main\n"
         "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code, stop.code\n"
         f"print('LOADED', sorted({HEAVY | {'numpy'}!r} & set(sys.modules)))\n"
     )

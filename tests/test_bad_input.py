@@ -26,8 +26,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from irlcli import interventions, provenance
+from irlcli import interventions
 from irlcli.errors import IrlError
+from irlcli.experiments import provenance
 from irlcli.store import Store
 
 LANDER = "--env lunar-lander --intervention engine-power=1x"
@@ -504,7 +505,7 @@ OPCODES = b"\x80\x02}q\x00(X\x04\x00\x00\x00kindK\x01u.R\x85\x86)]ebhcN\x88aos01
 )
 def test_fuzz_tensor_files(archive_path, data):
     """Whatever the pickle says, only errors with a hint and an exit code come of it."""
-    from irlcli.checkpoints import load_policy_file, load_reward_file
+    from irlcli.data.tensors import load_policy_file, load_reward_file
 
     torch_zip(archive_path, b"\x80\x02" + data)
     for load in (load_reward_file, load_policy_file):
@@ -517,7 +518,7 @@ def test_fuzz_tensor_files(archive_path, data):
 @given(at=st.floats(0, 1), bit=st.integers(0, 7), cut=st.booleans())
 def test_fuzz_a_real_reward_file(smoke_store, archive_path, at, bit, cut):
     """Flipped or cut anywhere: refused by name, or read (a flip in a tensor cannot be seen)."""
-    from irlcli.checkpoints import load_reward_file
+    from irlcli.data.tensors import load_reward_file
 
     data = bytearray((smoke_store.path / smoke_store.airl / "reward.pt").read_bytes())
     index = int(at * (len(data) - 1))
@@ -900,7 +901,7 @@ def test_small_files_take_no_large_memory(store_copy, tmp_path, kind):
     # Peak memory as the process itself sees it: what wait4 tells includes its parent before exec.
     code = (
         "import re, sys\n"
-        "from irlcli.cli import main\n"
+        "from irlcli.cli.main import main\n"
         "try:\n    main()\n"
         "finally:\n"
         "    status = open('/proc/self/status').read()\n"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from irlcli.dataset import (
+from irlcli.data.demonstrations import (
     EPISODES,
     STEPS,
     read_demonstrations,

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 from test_architecture import loaded_by
 
-from irlcli.experiments import EXPERIMENTS
-from irlcli.settings import load_settings
+from irlcli.configs import load_config
+from irlcli.experiments.matrix import EXPERIMENTS
 from irlcli.store import Store
 from irlcli.store.manifest import encode_provenance
 
@@ -337,7 +337,7 @@ def test_bad_requests_are_refused(irl, table_store, arguments, message, hint):
 def test_table2_needs_no_store_and_prints_the_settings(irl, tmp_path):
     done = irl("report", "table2", "--json", "--store", tmp_path / "none")
     rows = json.loads(done.out)["rows"]
-    ant = load_settings("ant").interventions
+    ant = load_config("ant").interventions
     assert {(r["knob"], tuple(r["id"]), tuple(r["ood"])) for r in rows if r["env"] == "ant"} == {
         (knob, values.id, values.ood) for knob, values in ant.items()
     }
@@ -362,7 +362,7 @@ def test_goal_demonstrations_favour_the_right(irl, tmp_path):
     plan = ["--dry-run", "--json", "--store", tmp_path / "runs"]
     collect = ["collect-experts", "--env", "ant", "--intervention"]
     assert irl(*collect, "goal-y", *plan).code == 0
-    listed = load_settings("ant").interventions["goal-y"]
+    listed = load_config("ant").interventions["goal-y"]
     assert dict(zip(listed.id, listed.episodes, strict=True)) == {"-900": 10, "0": 3}
     refused = irl(*collect, "goal-y", "--episodes", "1,2,3", *plan)
     assert refused.code == 2 and "3 episode counts for 2 settings" in refused.err
@@ -378,7 +378,7 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
     assert set(found["env"]) == {"lunar-lander"}
     assert set(found.index[found["use"] == "held out"]) == {
         f"{knob}={value}"
-        for knob, listed in load_settings("lunar-lander", "smoke").interventions.items()
+        for knob, listed in load_config("lunar-lander", "smoke").interventions.items()
         for value in listed.ood
     }
     row = found.loc["engine-power=1.5x"]

@@ -15,13 +15,13 @@ import pyarrow.parquet as pq
 import pytest
 from test_architecture import loaded_by
 
-from irlcli import checkpoints
-from irlcli.dataset import read_demonstrations
-from irlcli.descriptions import TabularReward
-from irlcli.envs.gridworld import gridworld
+from irlcli.data import tensors as checkpoints
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.descriptions import TabularReward
+from irlcli.envs.gridworld.env import gridworld
+from irlcli.envs.gridworld.tasks import usable_input
 from irlcli.errors import UsageError
-from irlcli.runner import Runner
-from irlcli.stages.gridworlds import usable_input
+from irlcli.experiments.runner import Runner
 from irlcli.stages.sweep_maxent import variants
 from irlcli.store import Store
 
@@ -214,11 +214,12 @@ def test_a_goal_behind_walls_is_the_users_to_mend():
 
 REQUEST = """
 from irlcli.interventions import parse_settings
-from irlcli.settings import load_settings
-from irlcli.stages import From, collect_experts, sweep_maxent, train_maxent
+from irlcli.configs import load_config
+from irlcli.stages.base import From
+from irlcli.stages import collect_experts, sweep_maxent, train_maxent
 
 def request(stage):
-    config = load_settings("gridworld", "smoke", overrides=["maxent.iterations=800"])
+    config = load_config("gridworld", "smoke", overrides=["maxent.iterations=800"])
     groups = parse_settings("gridworld", "path-group=1,2,3")
     unseen = parse_settings("gridworld", "blocked=1")
     if stage == "sweep-maxent":
@@ -228,7 +229,7 @@ def request(stage):
 """
 RUN = """
 import sys
-from irlcli.runner import Runner
+from irlcli.experiments.runner import Runner
 Runner(sys.argv[1], command=["irl", "test"], checkpoint_seconds=0.0).run(request(sys.argv[2]))
 """
 

@@ -23,11 +23,14 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from irlcli import cli, console, provenance
-from irlcli.checkpoints import RefusedCode, from_bytes, load_reward_file, restore, to_bytes
-from irlcli.dataset import EPISODES, STEPS
+from irlcli.cli import console
+from irlcli.cli import main as cli
+from irlcli.data.demonstrations import EPISODES, STEPS
+from irlcli.data.tensors import RefusedCode, from_bytes, load_reward_file, restore, to_bytes
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.stages import Stage, train_maxent, transfer
+from irlcli.experiments import provenance
+from irlcli.stages import train_maxent, transfer
+from irlcli.stages.base import Stage
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
@@ -55,7 +58,7 @@ GRIDWORLD = [
 # what it wrote, and the peak of the process's memory [KiB].
 MANY = """
 import contextlib, io, json, re, sys
-from irlcli.cli import main
+from irlcli.cli.main import main
 results = []
 for line in json.loads(sys.argv[1]):
     out, err, code = io.StringIO(), io.StringIO(), 0

@@ -8,18 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from irlcli.envs import make
+from irlcli.envs.registration import make
+from irlcli.envs.registry import ENVIRONMENTS, environment
+from irlcli.envs.spec import EnvironmentSpec, Knob
 from irlcli.errors import IrlError, UsageError
 from irlcli.interventions import (
-    ENVIRONMENTS,
-    Environment,
-    Knob,
     Setting,
     Value,
     check_observed,
     covers,
     env_kwargs,
-    environment,
     knob_of,
     overlap,
     parse_setting,
@@ -42,7 +40,7 @@ _FORMS = {
 def world():
     """An environment with a knob of every form, so that the whole grammar can be tried."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ENVIRONMENTS, WORLD, Environment(WORLD, "test/World-v0", 10, _FORMS))
+        patch.setitem(ENVIRONMENTS, WORLD, EnvironmentSpec(WORLD, "", "test/World-v0", 10, _FORMS))
         yield
 
 
@@ -144,7 +142,7 @@ def test_the_wrong_form_is_named(knob, text):
     with pytest.raises(UsageError) as caught:
         parse_value(WORLD, knob, text)
     assert " as " in caught.value.message and repr(text) in caught.value.message
-    for kind in _FORMS[knob].kinds:
+    for kind in _FORMS[knob].forms:
         assert kind in caught.value.message
     assert "write it like" in caught.value.hint
 
@@ -271,7 +269,7 @@ VALUES = {
 def test_what_is_printed_reads_back(case):
     """Settings are stored in their printed form, so it must lose not a single bit."""
     knob, numbers = case
-    value = Value(_FORMS[knob].kinds[0], tuple(x + 0.0 for x in numbers))
+    value = Value(_FORMS[knob].forms[0], tuple(x + 0.0 for x in numbers))
     setting = Setting(knob, value)
     assert parse_setting(WORLD, str(setting)) == setting
     assert str(parse_setting(WORLD, str(setting))) == str(setting)
@@ -306,7 +304,7 @@ def test_what_a_knob_says_of_observations_is_so():
         known = ENVIRONMENTS[env].knobs
         sizes = {}
         for name, knob in known.items():
-            value = {"triple": "1:1:1", "multiplier": "1x"}.get(knob.kinds[0], "1")
+            value = {"triple": "1:1:1", "multiplier": "1x"}.get(knob.forms[0], "1")
             made = make(env, parse_setting(env, f"{name}={value}"))
             sizes.setdefault(knob.observed, set()).add(made.observation_space.shape)
             made.close()

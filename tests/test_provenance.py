@@ -11,10 +11,11 @@ import msgspec
 import pytest
 import torch
 
-from irlcli import checkpoints, provenance
-from irlcli.runner import Runner, Silent
-from irlcli.stages import Job, Request, Stage
-from irlcli.stages.policy_training import _state
+from irlcli.data import tensors as checkpoints
+from irlcli.experiments import provenance
+from irlcli.experiments.runner import Runner, Silent
+from irlcli.rl.loop import _state
+from irlcli.stages.base import Job, Request, Stage
 from irlcli.store import Store
 
 ROUNDS = 4

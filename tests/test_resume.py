@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from irlcli.runner import Runner
+from irlcli.experiments.runner import Runner
 from irlcli.store import Store
 
 # The real stages at the smoke profile, checkpointing after every round; prints the id.
@@ -18,12 +18,13 @@ CHAIN = """
 import sys
 import msgspec
 from irlcli.interventions import parse_setting, parse_settings
-from irlcli.runner import Runner
-from irlcli.settings import load_settings
-from irlcli.stages import From, collect_experts, train_airl, transfer
+from irlcli.experiments.runner import Runner
+from irlcli.configs import load_config
+from irlcli.stages.base import From
+from irlcli.stages import collect_experts, train_airl, transfer
 
 def request(stage):
-    config = load_settings("lunar-lander", "smoke")
+    config = load_config("lunar-lander", "smoke")
     settings = parse_settings("lunar-lander", "engine-power=1x,1.25x")
     demos = collect_experts.request("lunar-lander", settings, config)
     if stage == "collect-experts":
@@ -156,16 +157,16 @@ def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count, gap):
 
 
 def test_a_foreign_input_that_changes_after_planning_is_noticed(tmp_path):
+    from irlcli.configs import load_config
     from irlcli.errors import IntegrityError
+    from irlcli.experiments.runner import source_of
     from irlcli.interventions import parse_settings
-    from irlcli.runner import source_of
-    from irlcli.settings import load_settings
     from irlcli.stages import evaluate
     from irlcli.store import Resolved
 
     path = tmp_path / "policy.pt"
     path.write_bytes(b"one")
-    config = load_settings("lunar-lander", "smoke")
+    config = load_config("lunar-lander", "smoke")
     request = evaluate.request(
         "lunar-lander",
         parse_settings("lunar-lander", "bounce=0.9"),

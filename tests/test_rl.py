@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from irlcli import rl
-from irlcli.checkpoints import from_bytes, to_bytes
+from irlcli.configs import PPOConfig
+from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.interventions import parse_settings
-from irlcli.settings import PPOSettings
+from irlcli.rl import ppo as rl
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.25x")
-PPO = PPOSettings(n_envs=4, n_steps=128, batch_size=128, n_epochs=2, rollouts_per_round=2)
+PPO = PPOConfig(n_envs=4, n_steps=128, batch_size=128, n_epochs=2, rollouts_per_round=2)
 
 
 def make_trainer(seed=0, limit=None, **changes):
-    ppo = PPOSettings(**{**{f: getattr(PPO, f) for f in PPO.__struct_fields__}, **changes})
+    ppo = PPOConfig(**{**{f: getattr(PPO, f) for f in PPO.__struct_fields__}, **changes})
     worlds = rl.make_worlds("lunar-lander", SETTINGS, ppo.n_envs)
     if limit is not None:
         worlds.max_episode_steps = limit

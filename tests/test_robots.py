@@ -12,15 +12,18 @@ import torch
 from msgspec import UNSET
 from PIL import Image
 
-from irlcli import envs, rl
-from irlcli.checkpoints import from_bytes, to_bytes
+from irlcli.configs import PPOConfig, load_config
+from irlcli.data.tensors import from_bytes, to_bytes
+from irlcli.envs import registration as envs
+from irlcli.envs.registry import environment
 from irlcli.envs.vector import VectorWorlds
 from irlcli.errors import StageFailed, UsageError
-from irlcli.interventions import environment, parse_setting, parse_settings
+from irlcli.interventions import parse_setting, parse_settings
+from irlcli.rl import ppo as rl
+from irlcli.rl.loop import train_rounds
 from irlcli.seeds import derive
-from irlcli.settings import PPOSettings, load_settings
-from irlcli.stages import From, Job, collect_experts, train_airl
-from irlcli.stages.policy_training import train_rounds
+from irlcli.stages import collect_experts, train_airl
+from irlcli.stages.base import From, Job
 from irlcli.store import Store
 
 SETTINGS = parse_settings("reacher", "gravity=0.5x,2x")
@@ -29,7 +32,7 @@ NORMALISED = {"normalise_observations": True, "normalise_rewards": True}
 
 
 def make_trainer(worlds=None, seed=0, **changes):
-    ppo = PPOSettings(**{**PPO, **changes})
+    ppo = PPOConfig(**{**PPO, **changes})
     worlds = worlds or rl.make_worlds("reacher", SETTINGS, ppo.n_envs)
     return rl.PPOTrainer(worlds, ppo, 1000, seed, "test")
 
@@ -75,7 +78,7 @@ def test_the_cap_on_the_deviation_holds_after_every_round():
 def test_a_cap_needs_continuous_actions():
     worlds = rl.make_worlds("lunar-lander", [parse_setting("lunar-lander", "bounce=0.5")], 1)
     with pytest.raises(UsageError, match=r"ppo\.log_std_max needs continuous actions"):
-        rl.PPOTrainer(worlds, PPOSettings(n_envs=1, log_std_max=-1.0), 1000, 0, "test")
+        rl.PPOTrainer(worlds, PPOConfig(n_envs=1, log_std_max=-1.0), 1000, 0, "test")
 
 
 def test_a_clone_is_the_maximum_likelihood_fit():
@@ -413,7 +416,7 @@ def test_a_killed_worker_is_a_named_failure(rounds):
 @pytest.mark.parametrize("env", ["ant", "half-cheetah", "reacher"])
 @pytest.mark.parametrize("profile", ["smoke", "standard", "paper"])
 def test_every_intervention_of_the_settings_can_be_learned_from(env, profile):
-    config = load_settings(env, profile)
+    config = load_config(env, profile)
     assert set(config.interventions) == set(environment(env).knobs)
     for knob, values in config.interventions.items():
         settings = parse_settings(env, f"{knob}={','.join(values.id)}")

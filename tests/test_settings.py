@@ -1,4 +1,4 @@
-"""Settings: what wins over what, what is refused, and whether the message names its source."""
+"""Config: what wins over what, what is refused, and whether the message names its source."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec import UNSET
 
+from irlcli.configs import PROFILES, Config, load_config
+from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.interventions import ENVIRONMENTS, parse_settings
-from irlcli.settings import PROFILES, Settings, load_settings
+from irlcli.interventions import parse_settings
 from irlcli.store import canonical_json
 
 LANDER = "lunar-lander"
@@ -35,7 +36,7 @@ def toml(tmp_path):
 def refused(*args, **kwargs) -> UsageError:
     """The error of loading these, checked for what every one of them owes the reader."""
     with pytest.raises(UsageError) as caught:
-        load_settings(LANDER, *args, **kwargs)
+        load_config(LANDER, *args, **kwargs)
     assert caught.value.hint
     assert "\n" not in caught.value.message
     return caught.value
@@ -47,7 +48,7 @@ def refused(*args, **kwargs) -> UsageError:
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("path", sorted(SETTINGS.glob("*.toml")), ids=lambda p: p.stem)
 def test_every_shipped_profile_loads(path, profile):
-    settings = load_settings(path.stem, profile)
+    settings = load_config(path.stem, profile)
     canonical_json(msgspec.to_builtins(settings))  # can be part of a key
     for knob, values in settings.interventions.items():
         trained, held_out = (
@@ -66,11 +67,11 @@ def test_every_environment_has_settings_and_the_reverse():
 
 @pytest.mark.parametrize("path", sorted(SETTINGS.glob("*/*.toml")), ids=lambda p: p.parent.name)
 def test_every_shipped_overlay_loads(path):
-    assert load_settings(path.stem, "standard", path) != load_settings(path.stem, "standard")
+    assert load_config(path.stem, "standard", path) != load_config(path.stem, "standard")
 
 
 def test_profiles_differ_and_smoke_is_small():
-    smoke, standard, paper = (load_settings(LANDER, p) for p in PROFILES)
+    smoke, standard, paper = (load_config(LANDER, p) for p in PROFILES)
     assert smoke.expert.total_steps < 10_000 < standard.expert.total_steps
     assert paper.expert.ppo.batch_size == 64  # rl-baselines3-zoo
     assert smoke != standard and standard != paper
@@ -81,28 +82,28 @@ def test_profiles_differ_and_smoke_is_small():
 
 def test_defaults_file_profile_settings_flags_and_set(toml):
     """defaults < settings file < profile < --settings < flags and --set."""
-    assert Settings().expert.total_steps == 1_000_000
-    assert load_settings(LANDER).expert.total_steps == 2_000_000
-    assert load_settings(LANDER, "smoke").expert.total_steps == 4096
+    assert Config().expert.total_steps == 1_000_000
+    assert load_config(LANDER).expert.total_steps == 2_000_000
+    assert load_config(LANDER, "smoke").expert.total_steps == 4096
     mine = toml("[expert]\ntotal_steps = 5000\n[airl]\npenalty_weight = 5\nmethod = 'irm'")
-    loaded = load_settings(LANDER, "smoke", mine)
+    loaded = load_config(LANDER, "smoke", mine)
     assert (loaded.expert.total_steps, loaded.airl.penalty_weight) == (5000, 5.0)
-    loaded = load_settings(LANDER, "smoke", mine, ["expert.total_steps=6000"])
+    loaded = load_config(LANDER, "smoke", mine, ["expert.total_steps=6000"])
     assert loaded.expert.total_steps == 6000
-    loaded = load_settings(
+    loaded = load_config(
         LANDER, "smoke", mine, [], {"airl.penalty_weight": 7.0, "airl.method": None}
     )
     assert (loaded.airl.penalty_weight, loaded.airl.method) == (7.0, "irm")
 
 
 def test_the_later_set_wins():
-    loaded = load_settings(LANDER, overrides=["airl.penalty_weight=1", "airl.penalty_weight=2"])
+    loaded = load_config(LANDER, overrides=["airl.penalty_weight=1", "airl.penalty_weight=2"])
     assert loaded.airl.penalty_weight == 2.0
 
 
 def test_a_layer_changes_only_what_it_names(toml):
-    before = load_settings(LANDER, "paper")
-    after = load_settings(LANDER, "paper", toml("[airl.ppo]\nn_envs = 3"))
+    before = load_config(LANDER, "paper")
+    after = load_config(LANDER, "paper", toml("[airl.ppo]\nn_envs = 3"))
     assert after.airl.ppo.n_envs == 3
     restored = msgspec.structs.replace(after.airl.ppo, n_envs=before.airl.ppo.n_envs)
     airl = msgspec.structs.replace(after.airl, ppo=restored)
@@ -115,7 +116,7 @@ def test_a_knob_has_experts_of_its_own(toml):
         "[expert.ppo]\nn_epochs = 3\ngamma = 0.5\n"
         "[interventions.bounce.expert_ppo]\nn_epochs = 7\nuse_sde = true"
     )
-    config = load_settings(LANDER, "smoke", mine, ["expert.ppo.gamma=0.25"])
+    config = load_config(LANDER, "smoke", mine, ["expert.ppo.gamma=0.25"])
     bounce, power = (
         config.expert_of(parse_settings(LANDER, text)[0])
         for text in ("bounce=0.1", "engine-power=1x")
@@ -124,27 +125,27 @@ def test_a_knob_has_experts_of_its_own(toml):
     assert (power.ppo.n_epochs, power.ppo.gamma) == (3, 0.25)
     changed = msgspec.structs.replace(config.expert.ppo, n_epochs=7, use_sde=True)
     assert bounce == msgspec.structs.replace(config.expert, ppo=changed)
-    later = load_settings(LANDER, "smoke", mine, ["expert.ppo.n_epochs=9"])
+    later = load_config(LANDER, "smoke", mine, ["expert.ppo.n_epochs=9"])
     assert later.expert_of(parse_settings(LANDER, "bounce=0.1")[0]).ppo.n_epochs == 9
 
 
 def test_an_empty_file_changes_nothing(toml):
-    assert load_settings(LANDER, "smoke", toml("")) == load_settings(LANDER, "smoke")
+    assert load_config(LANDER, "smoke", toml("")) == load_config(LANDER, "smoke")
 
 
 def test_environment_variables_never_enter(monkeypatch):
-    before = load_settings(LANDER)
+    before = load_config(LANDER)
     for name in ("AIRL_METHOD", "IRL_AIRL_METHOD", "IRL_PROFILE", "IRL_SETTINGS", "airl.method"):
         monkeypatch.setenv(name, "irm")
-    assert load_settings(LANDER) == before
+    assert load_config(LANDER) == before
 
 
 @pytest.mark.parametrize("text", ["30", "30.0", "3e1", " 30 ", "+30.0"])
 def test_however_written_it_is_one_value_and_so_one_key(toml, text):
     """An int in TOML, a float on the command line: equal settings must give equal artefacts."""
-    expected = load_settings(LANDER, flags={"airl.penalty_weight": 30.0})
-    from_set = load_settings(LANDER, overrides=[f"airl.penalty_weight={text}"])
-    from_file = load_settings(LANDER, file=toml(f"[airl]\npenalty_weight = {text}"))
+    expected = load_config(LANDER, flags={"airl.penalty_weight": 30.0})
+    from_set = load_config(LANDER, overrides=[f"airl.penalty_weight={text}"])
+    from_file = load_config(LANDER, file=toml(f"[airl]\npenalty_weight = {text}"))
     forms = {canonical_json(msgspec.to_builtins(s)) for s in (expected, from_set, from_file)}
     assert len(forms) == 1
 
@@ -168,7 +169,7 @@ def test_however_written_it_is_one_value_and_so_one_key(toml, text):
     ],
 )
 def test_set_is_typed_by_its_field(item, value):
-    loaded = load_settings(LANDER, overrides=[item])
+    loaded = load_config(LANDER, overrides=[item])
     for name in item.partition("=")[0].strip().split("."):
         loaded = getattr(loaded, name)
     assert loaded == value and type(loaded) is type(value)
@@ -333,7 +334,7 @@ def test_a_wrong_file_is_named_with_the_field(toml, text, named, hint):
 def test_the_layer_at_fault_is_named_not_an_innocent_one(toml):
     """A file may complete what it overrides only in part."""
     path = toml("[interventions.engine-power]\nood = ['2x']")
-    assert load_settings(LANDER, file=path).interventions["engine-power"].ood == ("2x",)
+    assert load_config(LANDER, file=path).interventions["engine-power"].ood == ("2x",)
     error = refused(file=path, flags={"airl.method": "gail"})
     assert "--method" in error.message and "gail" in error.message
     assert str(path) not in error.message
@@ -360,7 +361,7 @@ def test_unknown_profile(profile, hint):
 @pytest.mark.parametrize("env", ["lunar-landr", "", "../lunar-lander", "/etc/passwd", "moon"])
 def test_unknown_environment_reads_no_file(env):
     with pytest.raises(UsageError) as caught:
-        load_settings(env)
+        load_config(env)
     assert repr(env) in caught.value.message and "lunar-lander" in caught.value.hint
 
 
@@ -370,11 +371,11 @@ def test_unknown_environment_reads_no_file(env):
 @given(st.text(max_size=30) | st.from_regex(r"(airl|expert)\.[a-z_]{1,12}=.{0,12}", fullmatch=True))
 def test_any_set_is_taken_or_refused(item):
     try:
-        settings = load_settings(LANDER, "smoke", overrides=[item])
+        settings = load_config(LANDER, "smoke", overrides=[item])
     except UsageError as error:
         assert error.hint
     else:
-        assert isinstance(settings, Settings)
+        assert isinstance(settings, Config)
 
 
 FLOAT_FIELDS = [
@@ -391,7 +392,7 @@ FLOAT_FIELDS = [
 @given(st.sampled_from(FLOAT_FIELDS), st.floats())
 def test_what_is_taken_can_be_part_of_a_key(field, x):
     try:
-        settings = load_settings(LANDER, flags={field: x})
+        settings = load_config(LANDER, flags={field: x})
     except UsageError:
         return
     assert math.isfinite(x)
@@ -405,8 +406,8 @@ def test_any_file_is_taken_or_refused(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "any.toml"
     path.write_bytes(data)
     try:
-        settings = load_settings(LANDER, file=path)
+        settings = load_config(LANDER, file=path)
     except UsageError as error:
         assert str(path) in error.message and error.hint
     else:
-        assert isinstance(settings, Settings)
+        assert isinstance(settings, Config)

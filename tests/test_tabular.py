@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from irlcli.envs.gridworld import gridworld
+from irlcli.envs.gridworld.env import gridworld
 from irlcli.tabular import (
     DENSE_LIMIT,
     TabularMDP,

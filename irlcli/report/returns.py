@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from irlcli.descriptions import Evaluation, Subject
+from irlcli.data.descriptions import Evaluation, Subject
 from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import msgspec
 
+from irlcli.configs import PENALISED, AIRLConfig
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import Setting
-from irlcli.settings import PENALISED, AIRLSettings
-from irlcli.stages import From, Job, Request, Source, Stage, train_airl
+from irlcli.stages import train_airl
+from irlcli.stages.base import From, Job, Request, Source, Stage
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,7 +33,7 @@ def request(
     demos: Source | From,
     env: str,
     settings_: Sequence[Setting],
-    airl: AIRLSettings,
+    airl: AIRLConfig,
     weights: Sequence[float],
     seed: int = 0,
 ) -> Request:
@@ -75,8 +76,8 @@ def run(job: Job) -> None:
     """Read the scores; of weights that tie, the smallest is chosen."""
     import json
 
-    from irlcli import descriptions
-    from irlcli.stages.outputs import write_json
+    from irlcli.data import descriptions
+    from irlcli.data.outputs import write_json
 
     p: Parameters = job.parameters
     scores = []

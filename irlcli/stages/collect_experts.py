@@ -5,10 +5,12 @@ from typing import Any
 
 import msgspec
 
+from irlcli.configs import Config, GridworldConfig
+from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, environment, parse_setting
-from irlcli.settings import GridworldSettings, Settings
-from irlcli.stages import From, Job, Request, Stage, train_expert
+from irlcli.interventions import Setting, parse_setting
+from irlcli.stages import train_expert
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key, shown
 
 # Episodes become Python objects when a dataset is read; see dataset.py.
 _MOST_EPISODES = 100_000
@@ -17,8 +19,7 @@ _MOST_EPISODES = 100_000
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a dataset depends on, besides its experts."""
 
-    env: str
-    physics: int
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     episodes: tuple[int, ...]
     deterministic: bool
@@ -28,21 +29,21 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 class TabularParameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a gridworld's dataset depends on: its experts are part of the computation."""
 
-    env: str
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     episodes: tuple[int, ...]
     seed: int
-    gridworld: GridworldSettings
+    gridworld: GridworldConfig
 
 
 def request(
     env: str,
-    settings_: Sequence[Setting],
-    config: Settings,
+    settings: Sequence[Setting],
+    config: Config,
     seed: int = 0,
     episodes: Sequence[int] | None = None,
 ) -> Request:
-    """Demonstrations in ``settings_``; ``episodes`` is one count for all or one for each.
+    """Demonstrations in ``settings``; ``episodes`` is one count for all or one for each.
 
     Outputs ``steps.parquet``, ``episodes.parquet`` and ``summary.json``.
 
@@ -51,12 +52,12 @@ def request(
     """
     counts = tuple(episodes) if episodes else (config.demonstrations.episodes,)
     if len(counts) == 1:
-        counts *= len(settings_)
+        counts *= len(settings)
     if min(counts) < 1:
         raise UsageError(f"{min(counts)} episodes are no demonstrations", "record at least 1")
-    if len(counts) != len(settings_):
+    if len(counts) != len(settings):
         raise UsageError(
-            f"{len(counts)} episode counts for {len(settings_)} settings",
+            f"{len(counts)} episode counts for {len(settings)} settings",
             "give one count for all settings or one for each",
         )
     if sum(counts) > _MOST_EPISODES:
@@ -64,44 +65,45 @@ def request(
             f"{sum(counts):,} episodes are more than the {_MOST_EPISODES:,} of one dataset",
             "record fewer, or spread them over several seeds",
         )
-    texts = tuple(str(s) for s in settings_)
+    texts = tuple(str(s) for s in settings)
     label = f"collect-experts {env} {', '.join(texts)} seed {seed}"
-    shared = {"env": env, "settings": texts, "episodes": counts, "seed": seed}
+    shared = {
+        "environment": environment_key(env),
+        "settings": texts,
+        "episodes": counts,
+        "seed": seed,
+    }
     if environment(env).tabular:
         tabular = TabularParameters(**shared, gridworld=config.gridworld)
         return Request(TABULAR_STAGE, tabular, {}, label)
-    parameters = Parameters(
-        **shared,
-        physics=environment(env).physics,
-        deterministic=config.demonstrations.deterministic,
-    )
+    parameters = Parameters(**shared, deterministic=config.demonstrations.deterministic)
     # Experts do not depend on the seed of the sampling: every dataset shares them.
     experts = {
         f"expert {s}": From(train_expert.request(env, s, 0, config.expert_of(s)), "policy.pt")
-        for s in settings_
+        for s in settings
     }
     return Request(STAGE, parameters, experts, label)
 
 
 def run(job: Job) -> None:
     """Roll every expert out in its own setting."""
-    from irlcli import rl
-    from irlcli.checkpoints import load_policy_file
-    from irlcli.dataset import write_demonstrations
-    from irlcli.stages.outputs import shown, warn_of_errors, write_json
+    from irlcli.data.demonstrations import write_demonstrations
+    from irlcli.data.outputs import write_json
+    from irlcli.data.tensors import load_policy_file
+    from irlcli.rl.rollout import roll_out
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
     groups, summary = [], []
     for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True)):
-        setting = parse_setting(p.env, text)
+        setting = parse_setting(p.environment.name, text)
         policy, _ = load_policy_file(job.inputs[f"expert {text}"])
         # Of the setting's own, so that they are the same whatever else the dataset holds.
         purpose = f"{STAGE.name} {text}"
-        trajectories = rl.roll_out(
-            p.env, setting, policy, episodes, p.seed, purpose, p.deterministic
+        trajectories = roll_out(
+            p.environment.name, setting, policy, episodes, p.seed, purpose, p.deterministic
         )
-        warn_of_errors(job, text, trajectories)
+        job.warn_of_errors(text, trajectories)
         groups.append((setting, trajectories))
         summary.append(_summary(text, trajectories))
         facts = {text: shown(summary[-1]["mean_return"], summary[-1]["mean_progress"])}
@@ -110,27 +112,31 @@ def run(job: Job) -> None:
         "experts": {text: file_digest(job.inputs[f"expert {text}"]) for text in p.settings},
         "deterministic": p.deterministic,
     }
-    write_demonstrations(job.output, p.env, groups, metadata)
-    write_json(job.output / "summary.json", {"env": p.env, "settings": summary})
+    write_demonstrations(job.output, p.environment.name, groups, metadata)
+    write_json(
+        job.output / "summary.json", {"env": p.environment.name, "settings": summary}
+    )
 
 
 def run_tabular(job: Job) -> None:
     """Sample the policy that value iteration finds in each setting, ties broken at random."""
-    from irlcli.dataset import write_demonstrations
-    from irlcli.stages import gridworlds
-    from irlcli.stages.outputs import write_json
+    from irlcli.data.demonstrations import write_demonstrations
+    from irlcli.data.outputs import write_json
+    from irlcli.envs.gridworld import tasks as gridworlds
 
     p: TabularParameters = job.parameters
     groups, summary = [], []
     for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True)):
         trajectories = gridworlds.sample(text, p.gridworld, episodes, (p.seed, index))
-        groups.append((parse_setting(p.env, text), trajectories))
+        groups.append((parse_setting(p.environment.name, text), trajectories))
         summary.append(_summary(text, trajectories))
         facts = {text: f"return {summary[-1]['mean_return']:.0f}"}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {"experts": "value iteration", "gridworld": msgspec.to_builtins(p.gridworld)}
-    write_demonstrations(job.output, p.env, groups, metadata)
-    write_json(job.output / "summary.json", {"env": p.env, "settings": summary})
+    write_demonstrations(job.output, p.environment.name, groups, metadata)
+    write_json(
+        job.output / "summary.json", {"env": p.environment.name, "settings": summary}
+    )
 
 
 def _summary(text: str, trajectories: Sequence[Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Return of a policy over whole episodes, true and by a learned reward, in its settings or others."""
+"""Returns of a policy over whole episodes: true, and by a learned reward if one is given."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -6,10 +6,19 @@ from typing import Literal
 
 import msgspec
 
+from irlcli.configs import EvaluationConfig
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, check_tabular, environment, parse_setting
-from irlcli.settings import EvaluationSettings
-from irlcli.stages import From, Job, Request, Source, Stage
+from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.stages.base import (
+    EnvironmentKey,
+    From,
+    Job,
+    Request,
+    Source,
+    Stage,
+    environment_key,
+    shown,
+)
 
 Agent = Literal["policy", "random", "idle"]
 
@@ -17,30 +26,29 @@ Agent = Literal["policy", "random", "idle"]
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What an evaluation depends on, besides the policy and the reward."""
 
-    env: str
-    physics: int
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     agent: Agent
     seed: int
-    evaluation: EvaluationSettings
+    evaluation: EvaluationConfig
 
 
 def request(
     env: str,
-    settings_: Sequence[Setting],
-    evaluation: EvaluationSettings,
+    settings: Sequence[Setting],
+    evaluation: EvaluationConfig,
     policy: Source | From | None = None,
     agent: Agent = "policy",
     seed: int = 0,
-    who: str = "",
+    policy_label: str = "",
     reward: Source | From | None = None,
-    learned: str = "",
+    reward_label: str = "",
 ) -> Request:
-    """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``settings_``.
+    """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``settings``.
 
-    With ``reward``, a ``reward.pt``, also what that would pay. ``who`` says in the label whose
-    policy it is, ``learned`` how the reward was learned; they are no part of the identity.
-    Outputs ``episodes.parquet`` (a row per episode) and ``summary.json``.
+    With ``reward``, a ``reward.pt``, also the return by that reward. The labels tell whose policy
+    and reward these are; they are not part of the identity. Outputs ``episodes.parquet`` (a row
+    per episode) and ``summary.json``.
 
     Raises:
         UsageError: a tabular environment, or a policy missing or too many.
@@ -51,10 +59,14 @@ def request(
             f"agent {agent!r} {'needs a' if policy is None else 'takes no'} policy",
             "give a policy, or name the random or the idle agent",
         )
-    texts = tuple(str(s) for s in settings_)
+    if agent == "random":
+        # Its actions are random either way.
+        evaluation = msgspec.structs.replace(evaluation, deterministic=False)
+    if agent == "idle":
+        evaluation = msgspec.structs.replace(evaluation, deterministic=False)
+    texts = tuple(str(s) for s in settings)
     parameters = Parameters(
-        env=env,
-        physics=environment(env).physics,
+        environment=environment_key(env),
         settings=texts,
         agent=agent,
         seed=seed,
@@ -62,37 +74,54 @@ def request(
     )
     inputs = {"policy": policy, "reward": reward}
     inputs = {role: source for role, source in inputs.items() if source is not None}
-    label = f"evaluate {who or agent} in {env} {', '.join(texts)} seed {seed}"
-    label += f" by the reward of {learned}" if reward is not None else ""
+    label = f"evaluate {policy_label or agent} in {env} {', '.join(texts)} seed {seed}"
+    label += f" by the reward of {reward_label}" if reward is not None else ""
     return Request(STAGE, parameters, inputs, label)
 
 
 def run(job: Job) -> None:
-    """Roll out; episode k starts from the same state for every agent and in every method."""
+    """Roll out; episode k starts from the same state for every agent and every method."""
     import numpy as np
     import pyarrow as pa
 
-    from irlcli import envs, rl
-    from irlcli.checkpoints import load_policy_file
-    from irlcli.dataset import write_table
-    from irlcli.stages.frozen_reward import FrozenReward
-    from irlcli.stages.outputs import shown, warn_of_errors, write_json
+    from irlcli.data.demonstrations import write_table
+    from irlcli.data.outputs import write_json
+    from irlcli.data.tensors import load_policy_file, load_reward_file
+    from irlcli.envs.registration import make
+    from irlcli.learners.frozen import FrozenReward
+    from irlcli.rl.rollout import roll_out
+    from irlcli.rl.worlds import action_space
 
     p: Parameters = job.parameters
-    policy, subject = p.agent, {"agent": p.agent, "env": p.env}
+    env = p.environment.name
+    policy, subject = p.agent, {"agent": p.agent, "env": env}
     if "policy" in job.inputs:
         policy, origin = load_policy_file(job.inputs["policy"])
         subject = msgspec.to_builtins(origin)
         del subject["network"]
-    rows, summary, said = [], [], {"policy": subject}
+    document = {"policy": subject}
+    if "reward" in job.inputs:
+        model, learned = load_reward_file(job.inputs["reward"])
+        document["reward"] = {
+            name: getattr(learned, name) for name in ("method", "seed", "settings")
+        }
+    rows, summary = [], []
     for index, text in enumerate(p.settings):
-        setting, reward = parse_setting(p.env, text), None
+        setting = parse_setting(env, text)
+        learned_returns = None
         if "reward" in job.inputs:
-            with closing(envs.make(p.env, setting)) as world:
-                spaces = world.observation_space, world.action_space
-            reward = FrozenReward(job.inputs["reward"], p.env, f"{p.env} {text}", *spaces)
-        trajectories = rl.roll_out(
-            p.env,
+            with closing(make(env, setting)) as world:
+                frozen = FrozenReward(
+                    model,
+                    learned,
+                    horizon=p.environment.max_episode_steps,
+                    gamma=learned.network.gamma,
+                    where=f"{env} {text}",
+                    observation_size=world.observation_space.shape[0],
+                    actions=action_space(world.action_space),
+                )
+        trajectories = roll_out(
+            env,
             setting,
             policy,
             p.evaluation.episodes,
@@ -100,8 +129,9 @@ def run(job: Job) -> None:
             STAGE.name,
             p.evaluation.deterministic,
         )
-        warn_of_errors(job, text, trajectories)
-        progress = float(np.mean([t.progress for t in trajectories]))
+        job.warn_of_errors(text, trajectories)
+        if "reward" in job.inputs:
+            learned_returns = [frozen.of_episode(t) for t in trajectories]
         rows += [
             {
                 "setting": text,
@@ -111,10 +141,12 @@ def run(job: Job) -> None:
                 "progress": t.progress,
                 "length": len(t),
                 "terminated": t.terminated,
+                **({} if learned_returns is None else {"learned_return": learned_returns[k]}),
             }
             for k, t in enumerate(trajectories)
         ]
         returns = np.array([t.episode_return for t in trajectories])
+        progress = float(np.mean([t.progress for t in trajectories]))
         summary.append(
             {
                 "setting": text,
@@ -126,18 +158,13 @@ def run(job: Job) -> None:
                 "terminated": float(np.mean([t.terminated for t in trajectories])),
             }
         )
-        if reward is not None:
-            learned = [reward.of_episode(t) for t in trajectories]
-            for row, value in zip(rows[-len(learned) :], learned, strict=True):
-                row["learned_return"] = value
-            summary[-1]["mean_learned_return"] = float(np.mean(learned))
-            about = {name: getattr(reward.origin, name) for name in ("method", "seed", "settings")}
-            said["reward"] = about
+        if learned_returns is not None:
+            summary[-1]["mean_learned_return"] = float(np.mean(learned_returns))
         job.console.progress(
             index + 1, len(p.settings), "settings", {text: shown(returns.mean(), progress)}
         )
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
-    write_json(job.output / "summary.json", said | {"settings": summary})
+    write_json(job.output / "summary.json", document | {"settings": summary})
 
 
 STAGE = Stage("evaluate", 3, run)

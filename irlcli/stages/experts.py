@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from irlcli.stages import Job, Request, Source, Stage
+from irlcli.stages.base import Job, Request, Source, Stage
 from irlcli.stages.results import Cell, Run
 
 
@@ -43,9 +43,9 @@ def run(job: Job) -> None:
     """Read the evaluations and curves, and lay them out."""
     import pandas as pd
 
-    from irlcli import descriptions
+    from irlcli.data import descriptions
+    from irlcli.data.outputs import write_json
     from irlcli.report import experts
-    from irlcli.stages.outputs import write_json
     from irlcli.store import read_json
 
     p: Parameters = job.parameters

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import msgspec
 
+from irlcli.configs import Config
 from irlcli.interventions import Setting
-from irlcli.settings import Settings
-from irlcli.stages import From, Job, Request, Stage, sweep_maxent
+from irlcli.stages import sweep_maxent
+from irlcli.stages.base import From, Job, Request, Stage
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -19,7 +20,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def request(
-    env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Settings
+    env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Config
 ) -> Request:
     """Outputs ``figure2.png``, ``.pdf``, ``.csv`` (every measure) and ``.md`` (the table).
 
@@ -44,10 +45,10 @@ def run(job: Job) -> None:
     import pandas as pd
 
     from irlcli import tabular
-    from irlcli.envs.gridworld import walls
+    from irlcli.envs.gridworld import tasks as gridworlds
+    from irlcli.envs.gridworld.env import walls
     from irlcli.interventions import env_kwargs, parse_setting
     from irlcli.report import figure2, tables
-    from irlcli.stages import gridworlds
 
     p: Parameters = job.parameters
     grid, dataset = gridworlds.read(job.inputs["demonstrations"], p.env, p.settings)

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from irlcli.stages import Job, Request, Source, Stage
+from irlcli.stages.base import Job, Request, Source, Stage
 
 
 class Cell(msgspec.Struct, frozen=True, kw_only=False):
@@ -124,9 +124,9 @@ def run(job: Job) -> None:
     """Read the evaluations and write what is said of them; nothing is computed but statistics."""
     import pandas as pd
 
-    from irlcli import descriptions
+    from irlcli.data import descriptions
+    from irlcli.data.outputs import write_json
     from irlcli.report import curves, pages, results
-    from irlcli.stages.outputs import write_json
     from irlcli.store import read_json
 
     p: Parameters = job.parameters

@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from irlcli.configs import Config, Figure2Config, GridworldConfig, MaxEntConfig
 from irlcli.interventions import Setting, check_tabular
-from irlcli.settings import Figure2Settings, GridworldSettings, MaxEntSettings, Settings
-from irlcli.stages import From, Job, Request, Stage, collect_experts
+from irlcli.stages import collect_experts
+from irlcli.stages.base import From, Job, Request, Stage
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -22,8 +23,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     penalty_weights: tuple[float, ...]
     l2s: tuple[float, ...]
-    gridworld: GridworldSettings
-    maxent: MaxEntSettings
+    gridworld: GridworldConfig
+    maxent: MaxEntConfig
 
 
 class Variant(NamedTuple):
@@ -67,9 +68,9 @@ def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> Iterator
             yield Variant("irm", penalty, weight, 0.0, True)
 
 
-def datasets(env: str, settings_: Sequence[Setting], config: Settings) -> list[Request]:
+def datasets(env: str, settings_: Sequence[Setting], config: Config) -> list[Request]:
     """The demonstrations that the sweep learns from, one request a seed."""
-    f: Figure2Settings = config.figure2
+    f: Figure2Config = config.figure2
     return [
         collect_experts.request(env, settings_, config, seed, f.episodes)
         for seed in range(f.first_seed, f.first_seed + f.seeds)
@@ -77,7 +78,7 @@ def datasets(env: str, settings_: Sequence[Setting], config: Settings) -> list[R
 
 
 def request(
-    env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Settings
+    env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Config
 ) -> Request:
     """Fit all :func:`variants` to every dataset, and judge the rewards.
 
@@ -111,10 +112,10 @@ def run(job: Job) -> None:
     import pyarrow as pa
     import torch
 
-    from irlcli import checkpoints
-    from irlcli.dataset import write_table
-    from irlcli.irl import maxent
-    from irlcli.stages import gridworlds
+    from irlcli.data import tensors as checkpoints
+    from irlcli.data.demonstrations import write_table
+    from irlcli.envs.gridworld import tasks as gridworlds
+    from irlcli.learners import maxent
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
@@ -179,9 +180,9 @@ def _fit(job, settings, seeds, runs, occupancy, counts, rewards, state):
     import numpy as np
     import torch
 
-    from irlcli import checkpoints
-    from irlcli.irl import maxent
-    from irlcli.stages import gridworlds
+    from irlcli.data import tensors as checkpoints
+    from irlcli.envs.gridworld import tasks as gridworlds
+    from irlcli.learners import maxent
 
     p: Parameters = job.parameters
     m = p.maxent

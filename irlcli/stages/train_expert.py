@@ -1,60 +1,69 @@
-"""Expert of one setting: PPO on the true reward. Trained once, shared by every dataset."""
+"""The expert of one setting: PPO on the true reward. Trained once, shared by every dataset."""
 
 from contextlib import closing
 
 import msgspec
 
-from irlcli.interventions import Setting, check_tabular, environment
-from irlcli.settings import ExpertSettings, PPOSettings
-from irlcli.stages import Job, Request, Stage
+from irlcli.configs import ExpertConfig, PPOConfig
+from irlcli.configs.relevance import relevant_ppo
+from irlcli.envs.registry import environment
+from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.stages.base import (
+    EnvironmentKey,
+    Job,
+    Request,
+    Stage,
+    environment_key,
+    run_training,
+)
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What an expert depends on."""
 
-    env: str
-    physics: int
+    environment: EnvironmentKey
     setting: str
     seed: int
     total_steps: int
-    ppo: PPOSettings
+    ppo: PPOConfig
 
 
-def request(env: str, setting: Setting, seed: int, expert: ExpertSettings) -> Request:
+def request(env: str, setting: Setting, seed: int, expert: ExpertConfig) -> Request:
     """The expert of ``setting``: outputs ``policy.pt``, ``policy.json``, ``metrics.parquet``.
 
     Raises:
-        UsageError: a tabular environment.
+        UsageError: a tabular environment, or an option that needs continuous actions.
     """
     check_tabular(env, "train-expert", wanted=False)
     parameters = Parameters(
-        env=env,
-        physics=environment(env).physics,
+        environment=environment_key(env),
         setting=str(setting),
         seed=seed,
         total_steps=expert.total_steps,
-        ppo=expert.ppo,
+        ppo=relevant_ppo(expert.ppo, environment(env).discrete_actions, "expert.ppo"),
     )
     return Request(STAGE, parameters, {}, f"train-expert {env} {setting} seed {seed}")
 
 
 def run(job: Job) -> None:
-    """Train; the metrics hold one row per round with the true return of the episodes ended."""
-    from irlcli import rl
-    from irlcli.interventions import parse_setting
-    from irlcli.stages.outputs import write_metrics, write_policy
-    from irlcli.stages.policy_training import train_rounds
+    """Train; the metrics hold one row per round with the true return of the ended episodes."""
+    from irlcli.data.outputs import write_metrics, write_policy
+    from irlcli.rl.loop import LastRound, NoLearner, Training
+    from irlcli.rl.ppo import PPOTrainer, TrueReward
+    from irlcli.rl.worlds import make_worlds
 
     p: Parameters = job.parameters
-    settings = [parse_setting(p.env, p.setting)]
-    with closing(rl.make_worlds(p.env, settings, p.ppo.n_envs, job.workers)) as worlds:
-        trainer = rl.PPOTrainer(worlds, p.ppo, p.total_steps, p.seed, STAGE.name)
-        rows = train_rounds(job, trainer, [p.setting])
+    env = p.environment.name
+    settings = [parse_setting(env, p.setting)]
+    with closing(make_worlds(env, settings, p.ppo.n_envs, job.workers)) as worlds:
+        trainer = PPOTrainer(worlds, p.ppo, p.total_steps, p.seed, STAGE.name)
+        training = Training(trainer, TrueReward(), NoLearner(1), LastRound(), [p.setting])
+        rows = run_training(job, training)
     write_policy(
         job.output,
         trainer.policy,
         p.ppo,
-        p.env,
+        env=env,
         agent="expert",
         settings=(p.setting,),
         seed=p.seed,

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import msgspec
 
+from irlcli.configs import MaxEntConfig
 from irlcli.interventions import Setting, check_tabular
-from irlcli.settings import MaxEntSettings
-from irlcli.stages import From, Job, Request, Source, Stage
+from irlcli.stages.base import From, Job, Request, Source, Stage
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -16,7 +16,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seed: int
-    maxent: MaxEntSettings
+    maxent: MaxEntConfig
 
 
 def request(
@@ -24,7 +24,7 @@ def request(
     env: str,
     settings_: Sequence[Setting],
     unseen: Sequence[Setting],
-    maxent: MaxEntSettings,
+    maxent: MaxEntConfig,
     seed: int = 0,
 ) -> Request:
     """A reward learned from ``demos``, recorded in ``settings_`` of ``env``.
@@ -51,10 +51,11 @@ def run(job: Job) -> None:
     import numpy as np
     import torch
 
-    from irlcli import checkpoints, descriptions
-    from irlcli.irl import maxent
-    from irlcli.stages import gridworlds
-    from irlcli.stages.outputs import write_json, write_metrics
+    from irlcli.data import descriptions
+    from irlcli.data import tensors as checkpoints
+    from irlcli.data.outputs import write_json, write_metrics
+    from irlcli.envs.gridworld import tasks as gridworlds
+    from irlcli.learners import maxent
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from irlcli.envs.bullet.ant import Ant
-from irlcli.envs.bullet.half_cheetah import HalfCheetah
-from irlcli.envs.bullet.reacher import Reacher
+from irlcli.envs.ant.env import Ant
+from irlcli.envs.half_cheetah.env import HalfCheetah
+from irlcli.envs.reacher.env import Reacher
 
 ROBOTS = {"ant": Ant, "half_cheetah": HalfCheetah, "reacher": Reacher}
 

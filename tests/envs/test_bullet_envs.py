@@ -14,8 +14,8 @@ import pytest
 from bullet_robots import ROBOTS, body
 from gymnasium.utils.env_checker import check_env
 
-import irlcli.envs  # noqa: F401 (registers the environments)
-from irlcli.envs.bullet.ant import Ant
+import irlcli.envs.registration  # noqa: F401 (registers the environments)
+from irlcli.envs.ant.env import Ant
 from irlcli.envs.vector import VectorWorlds
 
 EVERY = [(name, model) for name in ROBOTS for model in ("merged", "original")]
@@ -184,7 +184,7 @@ def test_a_world_that_explodes_ends_its_episode_and_the_next_one_is_sound(env):
 QUIET = """
 import os, sys
 sys.path.insert(0, {fake!r})
-import irlcli.envs.bullet
+import irlcli.envs.registration.bullet
 print(sys.modules["pybullet"].__file__)
 """
 

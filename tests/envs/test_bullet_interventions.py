@@ -9,10 +9,10 @@ import pybullet
 import pytest
 from bullet_robots import ROBOTS, body, total_mass
 
-from irlcli.envs.bullet.ant import Ant
-from irlcli.envs.bullet.half_cheetah import HalfCheetah
-from irlcli.envs.bullet.reacher import Reacher
+from irlcli.envs.ant.env import Ant
 from irlcli.envs.bullet.world import GRAVITY
+from irlcli.envs.half_cheetah.env import HalfCheetah
+from irlcli.envs.reacher.env import Reacher
 
 
 def started(env, **options):

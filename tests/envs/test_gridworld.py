@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from irlcli.envs.gridworld import (
+from irlcli.envs.gridworld.env import (
     PATH_GROUPS,
     Gridworld,
     expert_policy,

@@ -6,8 +6,8 @@ import pytest
 from gymnasium.envs.box2d import lunar_lander as original
 from gymnasium.utils.env_checker import check_env
 
-from irlcli import envs
-from irlcli.envs.lunar_lander import LunarLander
+from irlcli.envs import registration as envs
+from irlcli.envs.lunar_lander.env import LunarLander
 from irlcli.interventions import parse_setting
 
 

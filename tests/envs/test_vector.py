@@ -4,9 +4,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from irlcli import rl
 from irlcli.envs.vector import VectorWorlds
 from irlcli.interventions import parse_settings
+from irlcli.rl import ppo as rl
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.5x")
 

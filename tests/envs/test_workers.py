@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from irlcli.envs.bullet.half_cheetah import HalfCheetah
+from irlcli.envs.half_cheetah.env import HalfCheetah
 from irlcli.envs.vector import VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
 

@@ -7,9 +7,9 @@ import pytest
 import scipy.stats
 import torch
 
-from irlcli.envs.lunar_lander import LunarLander
-from irlcli.irl import airl
-from irlcli.irl.networks import Normaliser, RewardModel
+from irlcli.envs.lunar_lander.env import LunarLander
+from irlcli.learners import airl
+from irlcli.learners.reward_model import Normaliser, RewardModel
 from irlcli.trajectories import Transitions, join
 
 GAMMA = 0.9

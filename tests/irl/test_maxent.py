@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from irlcli.envs.gridworld import (
+from irlcli.envs.gridworld.env import (
     PATH_GROUPS,
     expert_policy,
     gridworld,
@@ -17,7 +17,7 @@ from irlcli.envs.gridworld import (
     state_indices,
 )
 from irlcli.errors import UsageError
-from irlcli.irl.maxent import (
+from irlcli.learners.maxent import (
     SAFE_SPAN,
     RewardNetworks,
     assess,
@@ -29,7 +29,7 @@ from irlcli.irl.maxent import (
     shuffle_settings,
     solve,
 )
-from irlcli.irl.maxent_penalties import PENALTIES, penalty, penalty_gradient
+from irlcli.penalties.closed_form import PENALTIES, penalty, penalty_gradient
 from irlcli.tabular import dense_transitions, forward, stack
 
 GOALS = ("terminal", "absorbing")

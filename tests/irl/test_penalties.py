@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from irlcli.irl import penalties
+from irlcli.penalties import irmv1 as penalties
 
 SHAPE = (3, 2, 8)
 

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from msgspec.structs import replace
 
+from irlcli.configs import Config
 from irlcli.report import pages, results
 from irlcli.report.tables import latex_table, latex_text, markdown_table
-from irlcli.settings import Settings
 from irlcli.stages.results import Cell, Code, Others, Parameters, Row, Run
 
 SETTINGS = {
@@ -449,7 +449,7 @@ def test_markdown_tables_are_rectangular():
 def test_settings_of_the_rows_are_those_that_the_budgets_read():
     import msgspec
 
-    tree = msgspec.to_builtins(Settings())
+    tree = msgspec.to_builtins(Config())
     for stage, values in SETTINGS.items():
         assert set(values) <= set(tree[stage])
 

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from irlcli.descriptions import Evaluation, LearnedReward, Returns, Subject
+from irlcli.data.descriptions import Evaluation, LearnedReward, Returns, Subject
 from irlcli.errors import UsageError
 from irlcli.report.returns import rows
 

@@ -10,17 +10,19 @@ import numpy as np
 import pytest
 import torch
 
-from irlcli import rl
-from irlcli.dataset import Demonstrations
+from irlcli.configs import AIRLConfig, PPOConfig
+from irlcli.data.demonstrations import Demonstrations
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
-from irlcli.settings import AIRLSettings, PPOSettings
-from irlcli.stages import Source, selection, train_airl
-from irlcli.stages.actions import SeenActions
-from irlcli.stages.adversary import Adversary
+from irlcli.learners import selection
+from irlcli.learners.actions import SeenActions
+from irlcli.learners.adversary import Adversary
+from irlcli.rl import ppo as rl
+from irlcli.stages import train_airl
+from irlcli.stages.base import Source
 
 SETTINGS = parse_settings("reacher", "gravity=0.5x,2x")
-PPO = PPOSettings(n_envs=4, n_steps=160, batch_size=64, log_std_init=0.5)
+PPO = PPOConfig(n_envs=4, n_steps=160, batch_size=64, log_std_init=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +46,7 @@ def further_out(demos):
 
 
 def learned(demos, actions, policy_reward):
-    config = AIRLSettings(
+    config = AIRLConfig(
         actions=actions, policy_reward=policy_reward, updates_per_round=3, batch_size=32, ppo=PPO
     )
     trainer = rl.PPOTrainer(rl.make_worlds("reacher", SETTINGS, 4), PPO, 10_000, 0, "test")
@@ -92,7 +94,7 @@ def test_likelihoods_of_held_out_episodes_are_of_the_same_actions(demos):
 def test_sampled_is_what_unset_means():
     source = Source(Path("demos"), "0" * 64)
     unset, sampled, executed = (
-        train_airl.request(source, "reacher", SETTINGS, AIRLSettings(ppo=PPO, actions=actions))
+        train_airl.request(source, "reacher", SETTINGS, AIRLConfig(ppo=PPO, actions=actions))
         for actions in (msgspec.UNSET, "sampled", "executed")
     )
     assert unset.parameters == sampled.parameters != executed.parameters
@@ -100,4 +102,4 @@ def test_sampled_is_what_unset_means():
 
 def test_discrete_actions_have_no_bounds():
     with pytest.raises(UsageError, match=r"airl\.actions = executed needs continuous actions"):
-        SeenActions(AIRLSettings(actions="executed"), gymnasium.spaces.Discrete(4))
+        SeenActions(AIRLConfig(actions="executed"), gymnasium.spaces.Discrete(4))

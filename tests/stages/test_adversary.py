@@ -9,19 +9,20 @@ import pytest
 import torch
 from msgspec import UNSET
 
-from irlcli import rl
-from irlcli.checkpoints import to_bytes
-from irlcli.dataset import Demonstrations
+from irlcli.configs import AIRLConfig, PPOConfig
+from irlcli.data.demonstrations import Demonstrations
+from irlcli.data.tensors import to_bytes
 from irlcli.interventions import parse_settings
+from irlcli.learners.adversary import Adversary, deal, starts_by
+from irlcli.rl import ppo as rl
+from irlcli.rl.loop import train_rounds
 from irlcli.seeds import derive
-from irlcli.settings import AIRLSettings, PPOSettings
-from irlcli.stages import Job, train_airl
-from irlcli.stages.adversary import Adversary, deal, starts_by
-from irlcli.stages.policy_training import train_rounds
+from irlcli.stages import train_airl
+from irlcli.stages.base import Job
 from irlcli.trajectories import join
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.25x")
-CONFIG = AIRLSettings(updates_per_round=2, batch_size=32, ppo=PPOSettings(n_envs=8, n_steps=64))
+CONFIG = AIRLConfig(updates_per_round=2, batch_size=32, ppo=PPOConfig(n_envs=8, n_steps=64))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,7 @@ def test_deal_gives_every_group_its_share_of_every_setting():
 
 
 def test_rounds_cut_no_episode_that_the_discriminator_sees(demos):
-    trainer, adversary = make(demos, ppo=PPOSettings(n_envs=8, n_steps=1500))
+    trainer, adversary = make(demos, ppo=PPOConfig(n_envs=8, n_steps=1500))
     (rollout,) = trainer.train_round(0, partial(adversary.reward, policy=trainer.policy))
     groups = adversary._by_group([rollout], adversary._world_groups)
     for data in groups:

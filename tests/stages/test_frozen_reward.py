@@ -11,13 +11,16 @@ import pandas as pd
 import pytest
 import torch
 
-from irlcli import checkpoints, descriptions, rl
-from irlcli.checkpoints import load_policy_file
+from irlcli.configs import AIRLConfig
+from irlcli.data import descriptions
+from irlcli.data import tensors as checkpoints
+from irlcli.data.tensors import load_policy_file
+from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.interventions import environment, parse_setting
-from irlcli.irl.networks import RewardModel
-from irlcli.settings import AIRLSettings
-from irlcli.stages.frozen_reward import FrozenReward
+from irlcli.interventions import parse_setting
+from irlcli.learners.frozen import FrozenReward
+from irlcli.learners.reward_model import RewardModel
+from irlcli.rl import ppo as rl
 from irlcli.trajectories import Trajectory
 
 
@@ -152,7 +155,7 @@ def continuous(path, actions, numbers=None):
         activation="tanh",
         gamma=0.9,
     )
-    settings = AIRLSettings(method="erm", actions=actions, fixed_horizon=False)
+    settings = AIRLConfig(method="erm", actions=actions, fixed_horizon=False)
     about = descriptions.Reward(
         env="ant",
         settings=("mass=2x",),

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from irlcli import rl
-from irlcli.dataset import Demonstrations
+from irlcli.configs import AIRLConfig, PPOConfig
+from irlcli.data.demonstrations import Demonstrations
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
-from irlcli.settings import AIRLSettings, PPOSettings
-from irlcli.stages import selection
-from irlcli.stages.adversary import Adversary
+from irlcli.learners import selection
+from irlcli.learners.adversary import Adversary
+from irlcli.rl import ppo as rl
 from irlcli.store import Store, read_json
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.25x")
 FIRST, SECOND = (str(s) for s in SETTINGS)
-PPO = PPOSettings(n_envs=4, n_steps=64, batch_size=64)
+PPO = PPOConfig(n_envs=4, n_steps=64, batch_size=64)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def demos():
 def networks(demos):
     worlds = rl.make_worlds("lunar-lander", SETTINGS, PPO.n_envs)
     trainer = rl.PPOTrainer(worlds, PPO, 10_000, 0, "test")
-    return trainer, Adversary(demos, AIRLSettings(updates_per_round=2, ppo=PPO), worlds, 0)
+    return trainer, Adversary(demos, AIRLConfig(updates_per_round=2, ppo=PPO), worlds, 0)
 
 
 def test_the_first_of_the_best_rounds_is_kept_and_put_back(networks):
@@ -86,7 +86,7 @@ def test_log_likelihood_weighs_settings_not_steps(networks, demos):
 
 
 def test_held_out_episodes_are_not_trained_on(demos, networks):
-    config = AIRLSettings(select="episodes", select_every=1, select_episodes=1)
+    config = AIRLConfig(select="episodes", select_every=1, select_episodes=1)
     kept, chosen = selection.split(demos, config, rounds=1, seed=0)
     assert [len(group) for group in kept.trajectories.values()] == [5, 5]
     held_out = {text: group[-1:] for text, group in demos.trajectories.items()}
@@ -95,7 +95,7 @@ def test_held_out_episodes_are_not_trained_on(demos, networks):
 
 
 def test_a_selecting_setting_is_not_trained_on(demos, networks):
-    config = AIRLSettings(select=FIRST, select_every=1, select_episodes=2)
+    config = AIRLConfig(select=FIRST, select_every=1, select_episodes=2)
     kept, chosen = selection.split(demos, config, rounds=1, seed=3)
     assert list(kept.trajectories) == [SECOND]
     first, again = (chosen.consider(0, networks[0].policy, networks[1]) for _ in range(2))
@@ -108,7 +108,7 @@ def test_a_selecting_setting_is_not_trained_on(demos, networks):
 def test_a_single_demonstration_cannot_be_held_out(demos):
     one = Demonstrations("lunar-lander", {FIRST: demos.trajectories[FIRST][:1]}, {})
     with pytest.raises(UsageError, match="none can be held out"):
-        selection.split(one, AIRLSettings(select="episodes"), rounds=1, seed=0)
+        selection.split(one, AIRLConfig(select="episodes"), rounds=1, seed=0)
 
 
 @pytest.fixture(scope="module")

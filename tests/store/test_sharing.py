@@ -325,7 +325,7 @@ def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monk
 @pytest.mark.parametrize("text", ["name {id} kept", "ls", "show {id}", "HIT --name kept"])
 def test_nothing_is_collected_while_a_command_uses_it(irl, store_copy, monkeypatch, text):
     """gc asks at the last moment before the command ends."""
-    from irlcli import console
+    from irlcli.cli import console
 
     store = Store(store_copy.path)
     for name in (store_copy.path / ".names").iterdir():

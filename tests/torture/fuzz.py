@@ -45,7 +45,8 @@ class Target(NamedTuple):
 
 
 def interventions(place: Path) -> Target:
-    from irlcli.interventions import ENVIRONMENTS, parse_setting, parse_settings
+    from irlcli.envs.registry import ENVIRONMENTS
+    from irlcli.interventions import parse_setting, parse_settings
 
     def read(data: bytes) -> None:
         text = data.decode("utf-8", "surrogateescape")
@@ -65,21 +66,21 @@ def interventions(place: Path) -> Target:
 
 
 def overrides(place: Path) -> Target:
-    from irlcli.settings import load_settings
+    from irlcli.configs import load_config
 
     def read(data: bytes) -> None:
-        load_settings("gridworld", overrides=[data.decode("utf-8", "surrogateescape")])
+        load_config("gridworld", overrides=[data.decode("utf-8", "surrogateescape")])
 
     seeds = [b"airl.penalty_weight=30", b"airl.hidden=[32, 32]", b"expert.ppo.activation=relu"]
     return Target(seeds, read)
 
 
 def settings_files(place: Path) -> Target:
-    from irlcli.settings import load_settings
+    from irlcli.configs import load_config
 
     def read(data: bytes) -> None:
         (place / "settings.toml").write_bytes(data)
-        load_settings("gridworld", file=place / "settings.toml")
+        load_config("gridworld", file=place / "settings.toml")
 
     demo = Path(PACKAGE).parent / "settings" / "demo" / "lunar-lander.toml"
     seeds = [
@@ -153,7 +154,7 @@ def manifests(place: Path) -> Target:
 def describing(place: Path) -> Target:
     import json
 
-    from irlcli import descriptions
+    from irlcli.data import descriptions
     from irlcli.store import read_json
 
     policy = {"agent": "student", "env": "lunar-lander", "settings": ["bounce=0.5"], "seed": 0}
@@ -192,7 +193,7 @@ def _demonstrations(place: Path, changed: str) -> Target:
     import numpy as np
     import pyarrow.parquet as pq
 
-    from irlcli.dataset import read_demonstrations, write_demonstrations
+    from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
     from irlcli.interventions import parse_settings
     from irlcli.trajectories import Trajectory
 
@@ -239,7 +240,7 @@ def episodes(place: Path) -> Target:
 def tensors(place: Path) -> Target:
     import torch
 
-    from irlcli.checkpoints import load_policy_file, load_reward_file, to_bytes
+    from irlcli.data.tensors import load_policy_file, load_reward_file, to_bytes
 
     path = place / "reward.pt"
     sound = {"kind": "reward", "schema": 1, "description": "{}", "state": {"a": torch.zeros(2)}}

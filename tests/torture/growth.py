@@ -85,7 +85,7 @@ def audit(event, arguments):
             seen[event] = seen.get(event, 0) + 1
 sys.addaudithook(audit)
 sys.argv = ["irl", *{arguments!r}]
-from irlcli.cli import main
+from irlcli.cli.main import main
 try:
     main()
 finally:

@@ -70,13 +70,6 @@ def warm_up() -> None:
     import torch
     import torch._dynamo  # by the first optimiser, a second of work
 
-    import irlcli.checkpoints
-    import irlcli.cli
-    import irlcli.irl.maxent
-    import irlcli.rl
-    import irlcli.stages.adversary
-    import irlcli.stages.gridworlds  # noqa: F401
-
     torch.set_num_threads(1)
 
 
@@ -96,7 +89,8 @@ class Child:
         try:
             for number, log in zip((1, 2), self._log, strict=True):
                 os.dup2(log.fileno(), number)
-            from irlcli import cli, runner
+            from irlcli.cli import main as cli
+            from irlcli.experiments import runner
 
             # The one liberty taken: stages that last a second must have checkpoints to lose.
             runner.Runner = functools.partial(runner.Runner, checkpoint_seconds=0.0)

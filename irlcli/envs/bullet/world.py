@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import pybullet
 import pybullet_data
+
+from irlcli.envs.bullet.engine import pybullet
 
 Vector = tuple[float, float, float]
 Friction = tuple[float, float, float]

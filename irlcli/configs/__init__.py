@@ -1,0 +1,33 @@
+"""Hyperparameters: their schema, which of them matter, and how they are loaded."""
+
+from irlcli.configs.load import PROFILES, check_profile, load_config
+from irlcli.configs.schema import (
+    AIRLConfig,
+    Config,
+    DemonstrationConfig,
+    EvaluationConfig,
+    ExpertConfig,
+    Figure2Config,
+    GridworldConfig,
+    InterventionConfig,
+    MaxEntConfig,
+    PPOConfig,
+    TransferConfig,
+)
+
+__all__ = [
+    "PROFILES",
+    "AIRLConfig",
+    "Config",
+    "DemonstrationConfig",
+    "EvaluationConfig",
+    "ExpertConfig",
+    "Figure2Config",
+    "GridworldConfig",
+    "InterventionConfig",
+    "MaxEntConfig",
+    "PPOConfig",
+    "TransferConfig",
+    "check_profile",
+    "load_config",
+]

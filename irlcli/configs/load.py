@@ -1,0 +1,284 @@
+"""Configs from TOML files, profiles and ``--set``.
+
+One file per environment in ``settings/``. Precedence, weakest first: the defaults below, the
+environment's file, its profile, ``--settings FILE``, ``--set``, flags. Environment variables
+never enter: equal settings give equal artefacts wherever they run.
+"""
+
+import stat
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import msgspec
+from msgspec import Struct
+
+from irlcli.configs.schema import Config, ExpertConfig, InterventionConfig
+from irlcli.envs.registry import environment
+from irlcli.errors import UsageError, suggest
+from irlcli.interventions import knob_of, overlap, parse_settings
+
+PROFILES = ("smoke", "standard", "paper")
+
+# A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
+_MAX_TOML_BYTES = 64 << 10
+_MAX_TOML_LINE = 2000
+_INTERVENTIONS = dict[str, InterventionConfig]
+
+
+def check_profile(profile: str) -> None:
+    """Refuse what is no profile.
+
+    Raises:
+        UsageError: not one of :data:`PROFILES`.
+    """
+    if profile not in PROFILES:
+        raise UsageError(f"unknown profile {profile!r}", suggest(profile, PROFILES))
+
+
+def load_config(
+    env: str,
+    profile: str = "standard",
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+    flags: Mapping[str, Any] | None = None,
+) -> Config:
+    """The config of ``env``.
+
+    Args:
+        env: environment whose file in ``settings/`` is read.
+        profile: ``smoke``, ``standard`` or ``paper``.
+        file: a TOML file of the same form (without profiles), laid over the profile.
+        overrides: ``airl.penalty_weight=30``, each typed by its field.
+        flags: dotted field to value; None is left out.
+
+    Raises:
+        UsageError: unknown environment, profile, field or value; malformed TOML.
+        OSError: ``file`` cannot be read.
+    """
+    environment(env)
+    check_profile(profile)
+    own = settings_directory() / f"{env}.toml"
+    tree = read_toml(own)
+    profiles = tree.pop("profiles", {})
+    layers = [(str(own), tree), (f"{own}, profile {profile}", profiles.get(profile, {}))]
+    if file is not None:
+        layers.append((str(file), read_toml(file)))
+    layers += [(f"--set {item!r}", _override(item)) for item in overrides]
+    layers += [
+        (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted.split("."), value))
+        for dotted, value in (flags or {}).items()
+        if value is not None
+    ]
+    return _stack(env, layers)
+
+
+def _stack(env: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Config:
+    """The config of ``layers`` of (source, values); later layers win."""
+    tree: dict[str, Any] = {}
+    for source, values in layers:
+        if tree and not values:
+            # The standard profile is usually empty, and every command comes through here.
+            continue
+        tree = _merge(tree, values)
+        try:
+            config = _convert(env, tree)
+        except UsageError as error:
+            raise UsageError(f"{source}: {error.message}", error.hint) from None
+    interventions = {
+        knob: msgspec.structs.replace(intervention, expert=_expert_of_knob(knob, layers))
+        for knob, intervention in config.interventions.items()
+        if intervention.expert is not None
+    }
+    return msgspec.structs.replace(config, interventions=config.interventions | interventions)
+
+
+def _expert_of_knob(knob: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> ExpertConfig:
+    """In each layer the knob's own table wins over ``[expert]``; a later layer wins over both."""
+    tree: dict[str, Any] = {}
+    for _, values in layers:
+        tree = _merge(tree, values.get("expert", {}))
+        tree = _merge(tree, values.get("interventions", {}).get(knob, {}).get("expert", {}))
+    return msgspec.convert(tree, ExpertConfig)
+
+
+def settings_directory() -> Path:
+    """``settings/`` of the checkout, or its copy inside an installed package."""
+    packaged = Path(__file__).parent.parent / "settings_files"
+    return packaged if packaged.is_dir() else Path(__file__).parent.parent.parent / "settings"
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The TOML document in ``path``.
+
+    Raises:
+        UsageError: not a plain file, too large, malformed or unreadable.
+    """
+    try:
+        information = path.stat()
+        if not stat.S_ISREG(information.st_mode) and not stat.S_ISDIR(information.st_mode):
+            # Opening a named pipe would wait for a writer that never comes.
+            raise UsageError(f"{path} is not a plain file", "name a TOML file with --settings")
+        if information.st_size > _MAX_TOML_BYTES:
+            raise ValueError(f"it is larger than {_MAX_TOML_BYTES >> 10} KiB")
+        return _parse_toml(path.read_text("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UsageError(
+            f"{path} is not valid TOML: {error}", "see settings/ for examples"
+        ) from None
+    except OSError as error:
+        raise UsageError(
+            f"{path} cannot be read: {error.strerror}", "name a TOML file with --settings"
+        ) from None
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    if max(map(len, text.splitlines()), default=0) > _MAX_TOML_LINE:
+        raise ValueError(f"a line is longer than {_MAX_TOML_LINE} characters")
+    return tomllib.loads(text)
+
+
+def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for name, value in over.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+        merged[name] = _merge(merged[name], value) if both else value
+    return merged
+
+
+def _nest(path: Sequence[str], value: Any) -> dict[str, Any]:
+    for name in reversed(path):
+        value = {name: value}
+    return value
+
+
+def _convert(env: str, tree: Mapping[str, Any]) -> Config:
+    _check_names(tree, Config, ())
+    for knob in tree.get("interventions", {}):
+        knob_of(env, knob)
+    try:
+        settings = msgspec.convert(tree, Config)
+    except msgspec.ValidationError as error:
+        message, _, where = str(error).partition(" - at ")
+        field = where.strip("`").removeprefix("$.")
+        if field.startswith("interventions[...]"):
+            knob = next(k for k, v in tree["interventions"].items() if not _is_listed(v))
+            field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
+        raise UsageError(f"{field}: {message}", _field_hint(field)) from None
+    for knob, values in settings.interventions.items():
+        trained, unseen = (
+            parse_settings(env, f"{knob}={','.join(part)}") if part else ()
+            for part in (values.id, values.ood)
+        )
+        if len(values.episodes) not in (0, 1, len(trained)):
+            raise UsageError(
+                f"interventions.{knob}.episodes: {len(values.episodes)} episode counts for "
+                f"{len(trained)} settings",
+                "write one count for all, or one for each value of id",
+            )
+        if both := [str(s) for s in unseen if any(overlap(s, other) for other in trained)]:
+            raise UsageError(
+                f"interventions.{knob}: {', '.join(both)} is both trained in (id) and held out (ood)",
+                "hold out what nothing is trained in",
+            )
+    return settings
+
+
+def _is_listed(values: Any) -> bool:
+    try:
+        msgspec.convert(values, InterventionConfig)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
+    """Refuse unknown names, and values that are no tables: msgspec says too little of either."""
+    if kind == _INTERVENTIONS:
+        fields = dict.fromkeys(tree, InterventionConfig) if isinstance(tree, Mapping) else {}
+        inside = "[interventions.KNOB] with id and ood"
+    else:
+        fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+        inside = f"[{'.'.join(path)}] with some of: {', '.join(fields)}"
+    if not isinstance(tree, Mapping):
+        raise UsageError(f"{'.'.join(path)}: a table is needed, not {tree!r}", f"write {inside}")
+    for name, value in tree.items():
+        if name not in fields:
+            where = ".".join((*path, str(name)))
+            raise UsageError(f"no setting {where!r}", suggest(str(name), fields))
+        for inner in (fields[name], *get_args(fields[name])):
+            if inner == _INTERVENTIONS or (isinstance(inner, type) and issubclass(inner, Struct)):
+                _check_names(value, inner, (*path, name))
+                break
+
+
+def _override(item: str) -> dict[str, Any]:
+    dotted, equals, text = item.partition("=")
+    path = dotted.strip().split(".")
+    if not equals:
+        raise UsageError(f"--set {item!r} has no '='", "write --set airl.penalty_weight=30")
+    kind: Any = Config
+    for i, name in enumerate(path):
+        if not (isinstance(kind, type) and issubclass(kind, Struct)):
+            parent = ".".join(path[:i])
+            raise UsageError(
+                f"--set {item!r}: {parent} has no fields", f"write --set {parent}=VALUE"
+            )
+        fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+        if name not in fields:
+            homes = [f"{home}.{name}" for home in _homes(name)] if len(path) == 1 else []
+            hint = f"did you mean {' or '.join(homes)}?" if homes else suggest(name, fields)
+            raise UsageError(f"--set {item!r}: no setting {dotted.strip()!r}", hint)
+        kind = fields[name]
+        if kind == _INTERVENTIONS:
+            raise UsageError(
+                f"--set {item!r}: interventions are not set this way", "use --intervention or --ood"
+            )
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        names = ", ".join(f"{dotted.strip()}.{f.name}" for f in msgspec.structs.fields(kind))
+        raise UsageError(f"--set {item!r} names a group of settings", f"one of: {names}")
+    return _nest(path, _typed(text.strip(), kind, dotted.strip()))
+
+
+def _homes(name: str) -> list[str]:
+    """The groups of settings that have a field ``name``."""
+    return [
+        f.name
+        for f in msgspec.structs.fields(Config)
+        if isinstance(f.type, type) and issubclass(f.type, Struct)
+        if name in f.type.__struct_fields__
+    ]
+
+
+def _typed(text: str, kind: Any, field: str) -> Any:
+    if text == "none" and type(None) in get_args(kind):
+        return None
+    try:
+        value = _parse_toml(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        value = text
+    try:
+        return msgspec.to_builtins(msgspec.convert(value, kind))
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:
+        # Arguments may hold bytes that are no text.
+        raise UsageError(
+            f"--set {field}={text}: {str(error).partition(' - at ')[0]}", _field_hint(field)
+        ) from None
+
+
+def _field_hint(field: str) -> str:
+    """What a field takes: its choices if it has some, else a value that it could have."""
+    value, kind = Config(), Config
+    for name in field.split("."):
+        name = name.partition("[")[0]
+        if not isinstance(value, Struct) or not hasattr(value, name):
+            return "see settings/ for examples"
+        (kind,) = (f.type for f in msgspec.structs.fields(value) if f.name == name)
+        value = getattr(value, name)
+    for member in (kind, *get_args(kind)):
+        if get_origin(member) is Literal:
+            return f"one of: {', '.join(get_args(member))}"
+    if value is None:
+        return "write a value, or none"
+    return f"for example {msgspec.json.encode(value).decode()}"

@@ -1,0 +1,111 @@
+"""Which hyperparameters can matter: the others are set to their defaults before a key is made.
+
+Each function returns an equal config in which every field that cannot influence the result has
+one canonical value, so that requests for the same computation have the same key.
+"""
+
+from collections.abc import Iterable
+
+from msgspec.structs import replace
+
+from irlcli.configs.schema import AIRLConfig, MaxEntConfig, PPOConfig, TransferConfig
+from irlcli.errors import UsageError, suggest
+from irlcli.learners import LEARNERS
+from irlcli.penalties import check_penalty
+from irlcli.rl import ALGORITHMS
+
+_PPO = PPOConfig()
+_AIRL = AIRLConfig()
+_MAXENT = MaxEntConfig()
+
+
+def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOConfig:
+    """``ppo`` for an environment with discrete actions, or with continuous ones.
+
+    Raises:
+        UsageError: an option for continuous actions where they are discrete; the message names
+            ``section``, for example ``expert.ppo``.
+    """
+    if discrete_actions:
+        for name in ("use_sde", "log_std_init", "log_std_max"):
+            if getattr(ppo, name) != getattr(_PPO, name):
+                raise UsageError(
+                    f"{section}.{name} needs continuous actions", f"omit {section}.{name}"
+                )
+    if not ppo.use_sde:
+        ppo = replace(ppo, sde_sample_freq=None)
+    if ppo.ent_coef == 0.0:
+        ppo = replace(ppo, ent_coef_schedule=_PPO.ent_coef_schedule)
+    # A minibatch is at most the whole rollout.
+    return replace(ppo, batch_size=min(ppo.batch_size, max(2, ppo.n_envs * ppo.n_steps)))
+
+
+def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
+    """``airl`` without what its method, replay, selection and actions leave unused.
+
+    Raises:
+        UsageError: an unknown learner or penalty, or an option that does not fit the actions.
+    """
+    _check_known("airl.learner", airl.learner, LEARNERS)
+    check_penalty(airl.penalty, "airl")
+    if discrete_actions and airl.actions != _AIRL.actions:
+        raise UsageError(
+            f"airl.actions = {airl.actions} needs continuous actions", "omit airl.actions"
+        )
+    if airl.penalty == "none" or airl.penalty_weight == 0.0:
+        airl = replace(
+            airl,
+            penalty="none",
+            penalty_weight=0.0,
+            penalty_warmup_rounds=0,
+            penalty_ramp_rounds=0,
+            penalty_scaling=_AIRL.penalty_scaling,
+            penalty_estimate=_AIRL.penalty_estimate,
+        )
+        if airl.grouping == "per-setting":
+            # Without a penalty the mean of the settings' risks is all there is.
+            airl = replace(airl, grouping="balanced")
+    if airl.grouping == "pooled":
+        airl = replace(airl, pairing=_AIRL.pairing)
+    if airl.replay_share == 0.0:
+        airl = replace(
+            airl,
+            replay_episodes_per_round=_AIRL.replay_episodes_per_round,
+            replay_capacity=_AIRL.replay_capacity,
+        )
+    if airl.select == "last":
+        airl = replace(airl, select_every=_AIRL.select_every)
+    if airl.select in ("last", "episodes"):
+        airl = replace(airl, select_episodes=_AIRL.select_episodes)
+    return replace(airl, ppo=relevant_ppo(airl.ppo, discrete_actions, "airl.ppo"))
+
+
+def relevant_transfer(transfer: TransferConfig, discrete_actions: bool) -> TransferConfig:
+    """``transfer`` without what its algorithm leaves unused.
+
+    Raises:
+        UsageError: an unknown algorithm, or an option that does not fit the actions.
+    """
+    _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
+    return replace(transfer, ppo=relevant_ppo(transfer.ppo, discrete_actions, "transfer.ppo"))
+
+
+def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:
+    """``maxent`` without what its method and its features leave unused.
+
+    Raises:
+        UsageError: a penalty that MaxEnt IRL does not have.
+    """
+    check_penalty(maxent.penalty, "maxent")
+    if maxent.penalty == "none" or maxent.penalty_weight == 0.0:
+        maxent = replace(maxent, penalty="none", penalty_weight=0.0)
+        if maxent.grouping == "per-setting":
+            maxent = replace(maxent, grouping="balanced")
+    if maxent.features == "linear":
+        maxent = replace(maxent, hidden=_MAXENT.hidden)
+    return maxent
+
+
+def _check_known(field: str, value: str, known: Iterable[str]) -> None:
+    if value not in known:
+        raise UsageError(f"unknown {field} {value!r}", suggest(value, known))

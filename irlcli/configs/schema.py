@@ -1,0 +1,243 @@
+"""Every hyperparameter, with its type, bounds and default.
+
+A field is part of every key it can influence; :mod:`irlcli.configs.relevance` says where one
+cannot.
+"""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from irlcli.interventions import Setting
+
+# Bounded, so that every count fits 64 bits and no key holds an infinity or NaN.
+_MAX_COUNT = 2**53
+_MAX_FLOAT = 1e300
+Count = Annotated[int, Meta(ge=1, le=_MAX_COUNT)]
+NonNegativeCount = Annotated[int, Meta(ge=0, le=_MAX_COUNT)]
+Positive = Annotated[float, Meta(gt=0, le=_MAX_FLOAT)]
+NonNegative = Annotated[float, Meta(ge=0, le=_MAX_FLOAT)]
+Finite = Annotated[float, Meta(ge=-_MAX_FLOAT, le=_MAX_FLOAT)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+# gamma = 1 would make the value of an absorbing state infinite.
+Discount = Annotated[float, Meta(ge=0, lt=1)]
+# Bounded, so that no description can ask for a network that does not fit memory.
+Widths = Annotated[tuple[Annotated[int, Meta(ge=1, le=1024)], ...], Meta(max_length=6)]
+Schedule = Literal["constant", "linear"]
+Activation = Literal["tanh", "relu"]
+Grouping = Literal["pooled", "balanced", "per-setting", "shuffled"]
+
+
+class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """PPO (paper App. C names the values of rl-baselines3-zoo). ``linear`` falls to zero.
+
+    The last six fields are for continuous actions only, except ``normalise_*``.
+
+    Attributes:
+        n_envs: worlds stepped together.
+        n_steps: steps of each world in a rollout.
+        rollouts_per_round: rollouts, each followed by an update, between two fresh starts.
+        log_std_max: cap on the policy's log standard deviation. The environment clips actions,
+            so noise beyond the bounds costs the policy nothing.
+        use_sde: gSDE: noise is held for ``sde_sample_freq`` steps (None: for a rollout).
+    """
+
+    # Bounded, so that no file can ask for more worlds or steps than memory holds.
+    n_envs: Annotated[int, Meta(ge=1, le=1024)] = 16
+    n_steps: Annotated[int, Meta(ge=1, le=65536)] = 1024
+    rollouts_per_round: Count = 1
+    batch_size: Annotated[int, Meta(ge=2, le=_MAX_COUNT)] = 512
+    n_epochs: Count = 4
+    learning_rate: Positive = 1e-3
+    learning_rate_schedule: Schedule = "constant"
+    clip_range: Positive = 0.2
+    clip_range_schedule: Schedule = "constant"
+    gamma: Discount = 0.999
+    gae_lambda: Fraction = 0.98
+    ent_coef: NonNegative = 0.01
+    ent_coef_schedule: Schedule = "constant"
+    vf_coef: NonNegative = 0.5
+    max_grad_norm: Positive = 0.5
+    net_arch: Widths = (64, 64)
+    activation: Activation = "tanh"
+    ortho_init: bool = True
+    normalise_observations: bool = False
+    normalise_rewards: bool = False
+    log_std_init: Finite = 0.0
+    log_std_max: Finite | None = None
+    use_sde: bool = False
+    sde_sample_freq: Count | None = None
+
+
+class ExpertConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A policy trained on the true reward. ``bar`` is the mean true return that it must reach."""
+
+    total_steps: Count = 1_000_000
+    bar: Finite | None = None
+    ppo: PPOConfig = PPOConfig()
+
+
+class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Paper Table 2: the values trained on (``id``) and the held-out ones (``ood``).
+
+    Attributes:
+        episodes: demonstrations of each value trained on, where they differ.
+        expert: in a file, what this knob's experts need different from ``[expert]``; once
+            loaded, their whole config.
+    """
+
+    id: tuple[str, ...]
+    ood: tuple[str, ...]
+    episodes: tuple[Count, ...] = ()
+    expert: ExpertConfig | None = None
+
+
+class DemonstrationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Episodes per setting, sampled from the stochastic expert unless ``deterministic``."""
+
+    episodes: Count = 10
+    deterministic: bool = False
+
+
+class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Adversarial IRL (paper Sec. 4.3, Algorithm 1, App. C).
+
+    Attributes:
+        learner: a key of :data:`irlcli.learners.LEARNERS`.
+        grouping: which demonstrations share a risk. ``pooled``: all, by count. ``balanced``: all,
+            settings weighted equally. ``per-setting``: a risk for each setting. ``shuffled``: as
+            many risks, over episodes dealt out at random (the control).
+        penalty: of the risks; see :mod:`irlcli.penalties`. ``penalty_weight`` is lambda, zero for
+            the warm-up rounds and then raised linearly over the ramp rounds.
+        penalty_scaling: w multiplies the whole ``logit``, or only f (``reward``).
+        penalty_estimate: ``unbiased`` (product of two half-batches' gradients) or ``square``.
+        weight_decay: decoupled (AdamW), so that its strength does not depend on lambda.
+        replay_share: share of the discriminator's policy samples that come from past rounds;
+            each round adds ``replay_episodes_per_round`` episodes a setting, of which
+            ``replay_capacity`` are kept.
+        pairing: the policy's samples of a risk come from the same setting (``matched``) or from
+            all (``pooled``).
+        policy_reward: ``f-log-pi`` (Algorithm 1), ``f`` or ``g``.
+        fixed_horizon: an episode that ends early goes on in an absorbing state.
+        actions: what g and log pi see: the policy's samples (``sampled``), or what the environment
+            clips them to (``executed``).
+        bc_epochs: epochs of behavioural cloning before the first round.
+        select: the round that is kept: ``last``, the best on held-out ``episodes``, or the best in
+            one setting (``leg-length=1x``), which is left out of training. Scored every
+            ``select_every`` rounds, a setting over ``select_episodes``.
+    """
+
+    learner: str = "airl"
+    grouping: Grouping = "pooled"
+    penalty: str = "none"
+    penalty_weight: NonNegative = 10.0
+    penalty_warmup_rounds: NonNegativeCount = 10
+    penalty_ramp_rounds: NonNegativeCount = 10
+    penalty_scaling: Literal["logit", "reward"] = "logit"
+    penalty_estimate: Literal["unbiased", "square"] = "unbiased"
+    total_steps: Count = 1_000_000
+    state_only: bool = False
+    hidden: Widths = (32, 32)
+    activation: Activation = "tanh"
+    learning_rate: Positive = 3e-4
+    weight_decay: NonNegative = 1e-4
+    max_grad_norm: Positive = 1.0
+    updates_per_round: Count = 10
+    batch_size: Annotated[int, Meta(ge=2, le=_MAX_COUNT, multiple_of=2)] = 256
+    replay_share: Fraction = 0.5
+    replay_episodes_per_round: Count = 2
+    replay_capacity: Count = 100
+    pairing: Literal["matched", "pooled"] = "matched"
+    policy_reward: Literal["f-log-pi", "f", "g"] = "f-log-pi"
+    fixed_horizon: bool = True
+    actions: Literal["sampled", "executed"] = "sampled"
+    bc_epochs: NonNegativeCount = 0
+    select: str = "last"
+    select_every: Count = 10
+    select_episodes: Count = 10
+    ppo: PPOConfig = PPOConfig()
+
+
+class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A new policy on a frozen reward (paper Sec. 5.3).
+
+    ``algorithm`` is a key of :data:`irlcli.rl.ALGORITHMS`.
+    """
+
+    algorithm: str = "ppo"
+    total_steps: Count = 1_000_000
+    ppo: PPOConfig = PPOConfig()
+
+
+class EvaluationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Return of a policy over whole episodes."""
+
+    episodes: Count = 20
+    deterministic: bool = False
+
+
+class GridworldConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The gridworld of paper Sec. 5.1. Part of a dataset's identity, and recorded with it.
+
+    ``horizon`` [steps] is that of experts and learner. At the goal an episode ends
+    (``terminal``) or stays to the horizon (``absorbing``).
+    """
+
+    size: Annotated[int, Meta(ge=5, le=1024)] = 8
+    horizon: Count = 32
+    goal: Literal["terminal", "absorbing"] = "absorbing"
+    p_slip: Annotated[float, Meta(ge=0, lt=1)] = 0.2
+
+
+class MaxEntConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Tractable maximum-entropy IRL (paper Sec. 4.2, 5.1, App. A, C).
+
+    ``grouping`` and ``penalty`` are those of :class:`AIRLConfig`. The reward is an MLP's scalar
+    output (``features = "learned"``) or linear in the ``inputs`` of a state. ``held_out``
+    episodes of each setting's expert measure the likelihood.
+    """
+
+    grouping: Grouping = "pooled"
+    penalty: str = "none"
+    penalty_weight: NonNegative = 0.05
+    l2: NonNegative = 0.0
+    features: Literal["learned", "linear"] = "learned"
+    inputs: Literal["one-hot", "coordinates"] = "one-hot"
+    hidden: Count = 32
+    iterations: Count = 1000
+    learning_rate: Positive = 1e-3
+    held_out: Count = 200
+
+
+class Figure2Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Paper Fig. 2 as numbers: ``seeds`` datasets, the lambdas of IRM, the L2 weights of ERM.
+
+    The datasets' seeds begin at 1000: smaller ones are for trying things out.
+    """
+
+    seeds: Annotated[int, Meta(ge=2)] = 20
+    first_seed: NonNegativeCount = 1000
+    episodes: tuple[Count, ...] = (400, 25, 3)
+    penalty_weights: tuple[NonNegative, ...] = (0.01, 0.05, 0.2, 1.0)
+    l2s: tuple[NonNegative, ...] = (1e-3, 1e-2, 1e-1, 1.0)
+
+
+class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything that can be configured for one environment."""
+
+    interventions: dict[str, InterventionConfig] = {}
+    expert: ExpertConfig = ExpertConfig()
+    demonstrations: DemonstrationConfig = DemonstrationConfig()
+    airl: AIRLConfig = AIRLConfig()
+    transfer: TransferConfig = TransferConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    gridworld: GridworldConfig = GridworldConfig()
+    maxent: MaxEntConfig = MaxEntConfig()
+    figure2: Figure2Config = Figure2Config()
+
+    def expert_of(self, setting: Setting) -> ExpertConfig:
+        """The config of the expert of ``setting``, with what its knob needs different."""
+        intervention = self.interventions.get(setting.knob or "")
+        if intervention is None or intervention.expert is None:
+            return self.expert
+        return intervention.expert

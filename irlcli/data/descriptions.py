@@ -1,0 +1,224 @@
+"""What files say of themselves: rewards, policies, datasets, evaluations; checked before use.
+
+A file may come from anywhere, so nothing in it is trusted to have the right form: every
+description is validated here before a field of it is used.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from irlcli.configs.schema import (
+    Activation,
+    AIRLConfig,
+    Discount,
+    Finite,
+    GridworldConfig,
+    MaxEntConfig,
+    Positive,
+    Widths,
+)
+from irlcli.envs.registry import environment
+from irlcli.errors import IntegrityError, UsageError
+from irlcli.interventions import parse_setting
+
+Size = Annotated[int, Meta(ge=1, le=4096)]
+Settings = Annotated[tuple[str, ...], Meta(min_length=1)]
+MethodName = Annotated[str, Meta(max_length=100)]
+Agent = Literal["expert", "student", "transfer", "random", "idle"]
+
+
+class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Arguments of ``irl.networks.RewardModel``."""
+
+    observation_size: Size
+    action_size: Size
+    discrete: bool
+    state_only: bool
+    hidden: Widths
+    activation: Activation
+    gamma: Discount
+
+
+class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which round was kept, and its score: a mean log-likelihood, or a mean true return."""
+
+    round: Annotated[int, Meta(ge=0)]
+    score: Finite
+
+
+class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """``reward.json``, and the description inside ``reward.pt``.
+
+    ``scale`` is the standard deviation of g on the training data. ``selected`` is there if the
+    round was chosen on held-out data, else it is the last.
+    """
+
+    env: str
+    settings: Settings
+    method: MethodName
+    seed: int
+    airl: AIRLConfig
+    network: RewardNetwork
+    scale: Positive
+    selected: Selected | None = None
+
+
+class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``reward.json`` of train-maxent, and the description inside its ``reward.pt``."""
+
+    env: str
+    settings: Settings
+    method: MethodName
+    seed: int
+    gridworld: GridworldConfig
+    maxent: MaxEntConfig
+
+
+class PolicyNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What ``rl.policy.load_policy`` rebuilds an actor-critic network from."""
+
+    net_arch: Widths
+    activation: Activation
+    normalise_observations: bool
+    use_sde: bool
+
+
+class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """``policy.json``, and the description inside ``policy.pt``.
+
+    A student's ``settings`` are those it was trained in; a transferred policy also says which
+    reward it was trained on.
+    """
+
+    agent: Agent
+    env: str
+    settings: Settings
+    seed: int
+    network: PolicyNetwork
+    method: MethodName | None = None
+    reward_seed: int | None = None
+    reward_settings: tuple[str, ...] | None = None
+
+
+class Dataset(Struct, frozen=True, kw_only=True):
+    """The parameters of a dataset that planning needs."""
+
+    env: str
+    settings: Settings
+
+
+class Subject(Struct, frozen=True, kw_only=True):
+    """Whom an evaluation measured; ``settings`` are those that a policy was trained in."""
+
+    agent: Agent
+    env: str
+    settings: tuple[str, ...] = ()
+    method: MethodName | None = None
+    seed: int | None = None
+    reward_seed: int | None = None
+
+
+class LearnedReward(Struct, frozen=True, kw_only=True):
+    """Which reward an evaluation measured a policy by, besides the true one."""
+
+    method: MethodName
+    seed: int
+    settings: tuple[str, ...]
+
+
+class Returns(Struct, frozen=True, kw_only=True):
+    """True returns in one setting; of a learned reward, the mean of g / scale per episode."""
+
+    setting: str
+    episodes: Annotated[int, Meta(ge=1)]
+    mean_return: Finite
+    std_return: Finite | None = None
+    mean_progress: Finite | None = None
+    mean_learned_return: Finite | None = None
+    mean_length: Finite | None = None
+    terminated: Finite | None = None
+
+
+class Evaluation(Struct, frozen=True, kw_only=True):
+    """``summary.json`` of an evaluation; ``reward`` is there if it was asked for what that pays."""
+
+    policy: Subject
+    reward: LearnedReward | None = None
+    settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
+
+
+class SettingReturn(Struct, frozen=True, kw_only=True):
+    """What an expert earned in one setting while it was recorded."""
+
+    setting: str
+    episodes: Annotated[int, Meta(ge=1)]
+    mean_return: Finite
+
+
+class Collected(Struct, frozen=True, kw_only=True):
+    """``summary.json`` of a dataset."""
+
+    env: str
+    settings: tuple[SettingReturn, ...]
+
+
+class SettingQuality(Struct, frozen=True, kw_only=True):
+    """How the policy that is optimal for a tabular reward fares in one setting."""
+
+    setting: str
+    seen: bool
+    goal_probability: Finite | None
+    true_return: Finite | None
+    value_difference: Finite | None
+    rank_correlation: Finite | None
+    log_likelihood: Finite
+
+
+class Quality(Struct, frozen=True, kw_only=True):
+    """``quality.json`` of train-maxent."""
+
+    settings: tuple[SettingQuality, ...]
+
+
+Form = TypeVar("Form", Reward, TabularReward, Policy, Dataset, Evaluation)
+AnyForm = TypeVar("AnyForm", bound=Struct)
+
+
+def convert(value: Any, form: type[AnyForm], source: Path | str) -> AnyForm:
+    """``value`` (JSON) as a ``form``; names in it are not looked up.
+
+    Raises:
+        IntegrityError: of another form; the message names ``source``.
+    """
+    try:
+        return msgspec.convert(value, form)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise _malformed(source, error) from None
+
+
+def parse(value: Any, form: type[Form], source: Path | str) -> Form:
+    """``value`` (JSON) as a description of ``form``, its environment and settings known ones.
+
+    Raises:
+        IntegrityError: anything else; the message names ``source``.
+    """
+    description = convert(value, form, source)
+    try:
+        if isinstance(description, Evaluation):
+            env, settings = description.policy.env, [s.setting for s in description.settings]
+        else:
+            env, settings = description.env, description.settings
+        environment(env)
+        for setting in settings:
+            parse_setting(env, setting)
+    except UsageError as error:
+        raise _malformed(source, error) from None
+    return description
+
+
+def _malformed(source: Path | str, error: Exception) -> IntegrityError:
+    reason = str(error).splitlines()[0][:300]
+    return IntegrityError(f"{source}: its description is malformed ({reason})")

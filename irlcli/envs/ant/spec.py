@@ -1,0 +1,15 @@
+"""Ant's knobs (paper Table 2)."""
+
+from irlcli.envs.bullet.knobs import WALKER_KNOBS
+from irlcli.envs.spec import EnvironmentSpec, Knob
+
+SPEC = EnvironmentSpec(
+    name="ant",
+    entry_point="irlcli.envs.ant.env:Ant",
+    gym_id="irlcli/Ant-v0",
+    max_episode_steps=1000,
+    knobs={
+        **WALKER_KNOBS,
+        "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
+    },
+)

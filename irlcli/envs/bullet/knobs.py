@@ -1,0 +1,25 @@
+"""The knobs that Ant and HalfCheetah share (paper Table 2)."""
+
+from irlcli.envs.spec import Knob
+
+WALKER_KNOBS = {
+    "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "mass of every link"),
+    "goal-y": Knob(
+        "goal_y", ("absolute",), -1e4, 1e4, "the goal is at (1000, goal-y) m", observed=True
+    ),
+    "direction": Knob(
+        "direction",
+        ("absolute", "range"),
+        -180.0,
+        180.0,
+        "direction of the goal, degrees from ahead",
+        observed=True,
+    ),
+    "friction": Knob(
+        "friction",
+        ("triple",),
+        0.0,
+        10.0,
+        "tangential, torsional and rolling friction of the robot's links",
+    ),
+}

@@ -1,0 +1,18 @@
+"""LunarLander's knobs (paper Table 2)."""
+
+from irlcli.envs.spec import EnvironmentSpec, Knob
+
+SPEC = EnvironmentSpec(
+    name="lunar-lander",
+    entry_point="irlcli.envs.lunar_lander.env:LunarLander",
+    gym_id="irlcli/LunarLander-v0",
+    max_episode_steps=1000,
+    knobs={
+        "bounce": Knob("bounce", ("absolute",), 0.0, 1.0, "restitution of hull and legs"),
+        "friction": Knob("friction", ("absolute",), 0.0, 10.0, "friction of the moon"),
+        "engine-power": Knob(
+            "engine_power", ("multiplier",), 0.05, 20.0, "power of the main engine"
+        ),
+    },
+    discrete_actions=True,
+)

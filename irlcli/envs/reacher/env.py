@@ -1,0 +1,180 @@
+"""The PyBullet Reacher with the gravity intervention of the paper's Sec. 5.2 and Table 2.
+
+Observation, reward and physics are those of pybullet-gym's ReacherBulletEnv, but for gravity,
+which the original has none of.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from irlcli.envs.bullet.engine import pybullet
+from irlcli.envs.bullet.episode import RobotEnv
+from irlcli.envs.bullet.world import (
+    FROM_TO_MARGIN,
+    GRAVITY,
+    TIME_STEP,
+    Capsule,
+    Link,
+    Robot,
+    Vector,
+    World,
+    box_inertia,
+    require,
+    require_model,
+    single,
+)
+
+_RADIUS = single(0.01)
+_BALL_RADIUS = 0.01
+_HEIGHT = single(0.01)
+_UPPER = single(0.1)
+_FINGERTIP = single(0.11)
+_ELBOW_LIMIT = 3.0
+
+
+def morphology() -> tuple[Link, list[Link]]:
+    """The Reacher's fixed base and its 2 links: 2 where the original has 5.
+
+    The fingertip's ball is one body with the lower arm that carries it.
+    """
+    arm = Capsule((0.0, 0.0, 0.0), (_UPPER, 0.0, 0.0), _RADIUS)
+    thickness = 2.0 * (_RADIUS + FROM_TO_MARGIN)
+    inertia = box_inertia(arm.mass, (_UPPER + thickness, thickness, thickness))
+    ball = Capsule((_FINGERTIP, 0.0, 0.0), (_FINGERTIP, 0.0, 0.0), _BALL_RADIUS)
+    mass = arm.mass + ball.mass
+    center = (arm.mass * arm.center[0] + ball.mass * _FINGERTIP) / mass
+    # Parallel axes: both centres of mass lie on x, so only the moments about y and z grow.
+    offset = arm.mass * (arm.center[0] - center) ** 2 + ball.mass * (_FINGERTIP - center) ** 2
+    own = 0.4 * ball.mass * _BALL_RADIUS**2
+    lower = (inertia[0] + own, inertia[1] + own + offset, inertia[2] + own + offset)
+    links = [
+        Link(arm.mass, inertia, (arm,), arm.center, anchor=(0.0, 0.0, _HEIGHT)),
+        Link(
+            mass,
+            lower,
+            (arm, ball),
+            (center, 0.0, 0.0),
+            parent=0,
+            anchor=(_UPPER, 0.0, 0.0),
+            limits=(-_ELBOW_LIMIT, _ELBOW_LIMIT),
+        ),
+    ]
+    return Link(0.0, (0.0, 0.0, 0.0)), links
+
+
+class Reacher(RobotEnv):
+    """A two-link arm on a leaning table that moves its fingertip to a target.
+
+    Observation [9] float32: target x and y, fingertip minus target x and y, cosine and sine of
+    the shoulder's angle, its speed / 10, the elbow's angle / 3, its speed / 10. Action [2]:
+    torques of shoulder and elbow in units of 0.05 N m, clipped to [-1, 1].
+
+    The reward is the sum of the terms in ``info``: ``progress`` (100 times the distance gained
+    on the target), ``control`` (work and stall cost of the clipped action) and ``stuck`` (-0.1
+    with the elbow at its limit). An episode never terminates. A world whose state is no longer
+    finite truncates the episode at its last finite observation, pays nothing, and says so in
+    ``info["error"]``.
+
+    On a level table gravity acts along the joints' axes and turns neither: every setting would
+    be the same to the last bit. On a table that leans by ``tilt`` the sine of it pulls toward
+    -y. The motors hold the stretched arm up to 7.3 times gravity at 5 degrees, but not even
+    once on a vertical table.
+
+    Args:
+        gravity: multiplier of 9.8 m/s^2, in [0, 20]; the original has none.
+        tilt: of the table, degrees in [0, 90].
+        model: ``"merged"`` or ``"original"`` (5 links).
+        render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
+
+    Raises:
+        ValueError: a value outside the range given.
+        RuntimeError: ``"human"`` without a display.
+    """
+
+    start_range = (3.14, 3.14, 0.27, 0.27)
+    torques = np.full(2, 0.05)
+    camera = 0.55, -65.0
+
+    def __init__(
+        self,
+        gravity: float = 1.0,
+        tilt: float = 5.0,
+        model: str = "merged",
+        render_mode: str | None = None,
+    ):
+        self.gravity = require("gravity", gravity, 0.0, 20.0)
+        self.tilt = require("tilt", tilt, 0.0, 90.0)
+        self.model = require_model(model)
+        strength, angle = self.gravity * GRAVITY, math.radians(self.tilt)
+        pull = 0.0, -strength * math.sin(angle), -strength * math.cos(angle)
+        world = World(render_mode, pull, substeps=1, ground=False)
+        super().__init__(world, 9, render_mode)
+
+    def _place(self, positions: np.ndarray) -> Robot:
+        self._target = float(positions[2]), float(positions[3])
+        client = self._world.client
+        if self.model == "original":
+            *_, arm, target = self._world.load("reacher.xml")
+            for joint, position in enumerate(self._target):
+                pybullet.resetJointState(target, joint, position, physicsClientId=client)
+            robot = Robot(client, arm, (0, 2), (0, 2))
+            robot.place(positions[:2])
+            return robot
+        arm = self._world.build(*morphology(), (0.0, 0.0, 0.0))
+        for link in range(2):
+            # The original's geometries do not collide either.
+            pybullet.setCollisionFilterGroupMask(arm, link, 0, 0, physicsClientId=client)
+        robot = Robot(client, arm, (0, 1), (0, 1))
+        if self.render_mode is not None:
+            robot.paint((0.0, 0.4, 0.6, 1.0))
+            pybullet.createMultiBody(
+                0.0,
+                baseVisualShapeIndex=pybullet.createVisualShape(
+                    pybullet.GEOM_SPHERE,
+                    radius=0.009,
+                    rgbaColor=(0.9, 0.2, 0.2, 1.0),
+                    physicsClientId=client,
+                ),
+                basePosition=(*self._target, _HEIGHT),
+                physicsClientId=client,
+            )
+        robot.place(positions[:2])
+        return robot
+
+    def _reward(
+        self, action: np.ndarray, observation: np.ndarray, gain: float
+    ) -> tuple[float, dict[str, float]]:
+        first, second = np.abs(action).tolist()
+        first_speed, elbow, second_speed = np.abs(observation[6:]).tolist()
+        control = -0.1 * (first * first_speed + second * second_speed) - 0.01 * (first + second)
+        stuck = -0.1 if abs(elbow - 1.0) < 0.01 else 0.0
+        return gain + control + stuck, {"progress": gain, "control": control, "stuck": stuck}
+
+    def _focus(self) -> Vector:
+        return 0.0, 0.0, 0.0
+
+    def _observe(self) -> tuple[np.ndarray, float]:
+        """The observation and -100 times the fingertip's distance to the target."""
+        (shoulder, elbow), (shoulder_speed, elbow_speed) = self._robot.states()
+        # The original reads links' cached positions, which are one step old.
+        upper = shoulder - TIME_STEP * shoulder_speed
+        lower = upper + elbow - TIME_STEP * elbow_speed
+        x = _UPPER * math.cos(upper) + _FINGERTIP * math.cos(lower) - self._target[0]
+        y = _UPPER * math.sin(upper) + _FINGERTIP * math.sin(lower) - self._target[1]
+        observation = np.array(
+            [
+                *self._target,
+                x,
+                y,
+                math.cos(shoulder),
+                math.sin(shoulder),
+                0.1 * shoulder_speed,
+                elbow / _ELBOW_LIMIT,
+                0.1 * elbow_speed,
+            ],
+            dtype=np.float32,
+        )
+        return observation, -100.0 * math.hypot(x, y)

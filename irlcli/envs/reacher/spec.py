@@ -1,0 +1,12 @@
+"""Reacher's knob (paper Table 2)."""
+
+from irlcli.envs.spec import EnvironmentSpec, Knob
+
+SPEC = EnvironmentSpec(
+    name="reacher",
+    entry_point="irlcli.envs.reacher.env:Reacher",
+    gym_id="irlcli/Reacher-v0",
+    max_episode_steps=150,
+    knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "multiple of 9.8 m/s^2")},
+    physics=2,
+)

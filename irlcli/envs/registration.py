@@ -1,0 +1,35 @@
+"""Environments by setting, and their registration with gymnasium.
+
+Gymnasium calls :func:`register` by the entry point ``gymnasium.envs``, so that
+``gymnasium.make("irlcli/LunarLander-v0", bounce=0.5)`` works wherever irlcli is installed.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from irlcli.envs.registry import ENVIRONMENTS, environment
+from irlcli.interventions import Setting, env_kwargs
+
+
+def register() -> None:
+    """Register every environment with gymnasium; a second call changes nothing."""
+    for spec in ENVIRONMENTS.values():
+        if spec.gym_id not in gymnasium.registry:
+            gymnasium.register(
+                spec.gym_id,
+                entry_point=spec.entry_point,
+                max_episode_steps=spec.max_episode_steps,
+            )
+
+
+def make(env: str, setting: Setting, render_mode: str | None = None) -> gymnasium.Env:
+    """The bare environment of one setting, without gymnasium's wrappers or time limit.
+
+    Raises:
+        UsageError: unknown environment, or an intervention it does not have.
+    """
+    register()
+    return gymnasium.make(
+        environment(env).gym_id, render_mode=render_mode, **env_kwargs(env, setting)
+    ).unwrapped

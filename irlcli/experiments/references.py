@@ -1,0 +1,172 @@
+"""What a reference given to ``--demos``, ``--reward`` or ``--policy`` stands for.
+
+Planning needs to know the environment and the settings behind it. Inside the store a JSON
+output says so and no tensor library is loaded; a foreign file is opened and asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from irlcli.data import descriptions
+from irlcli.errors import NotFound, UsageError
+from irlcli.experiments.runner import source_of
+from irlcli.stages.base import Source
+from irlcli.store import Artefact, Index, Resolved, Store, read_json
+
+
+def tensor_file(
+    store: Store, ref: str, kind: Literal["reward", "policy"]
+) -> tuple[Source, descriptions.Reward | descriptions.Policy]:
+    """The ``reward`` or ``policy`` that ``ref`` names, and its description.
+
+    A reference to a whole artefact stands for its file of that kind.
+
+    Raises:
+        NotFound: no such thing, or an artefact without one.
+        UsageError: a tensor file of the other kind.
+        IntegrityError: damaged, foreign or hostile.
+    """
+    resolved = store.resolve(ref)
+    artefact = resolved.artefact
+    if artefact is None:
+        from irlcli.data.tensors import load
+
+        path = resolved.path / f"{kind}.pt" if resolved.path.is_dir() else resolved.path
+        if not path.exists():
+            raise NotFound(f"{resolved.path} holds no {kind}.pt", f"name a {kind} file")
+        description, _ = load(path, kind)
+        return source_of(Resolved(None, path)), description
+    if artefact.manifest.record.stage == "train-maxent":
+        raise UsageError(
+            f"{ref!r} is a tabular-reward, not a {kind}",
+            "policies are not trained on it: its quality.json says what it is worth",
+        )
+    output = resolved.output or _only(artefact, f"{kind}.pt")
+    if output != f"{kind}.pt":
+        raise UsageError(
+            f"{ref!r} is {output}, not a {kind}", f"name {artefact.id}/{kind}.pt or the artefact"
+        )
+    source = source_of(Resolved(artefact, artefact.directory / output))
+    form = descriptions.Reward if kind == "reward" else descriptions.Policy
+    path = store.open(artefact, _only(artefact, f"{kind}.json"))
+    return source, descriptions.parse(read_json(path), form, path)
+
+
+def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
+    """The dataset that ``ref`` names, its environment and its settings.
+
+    Raises:
+        NotFound: no such thing.
+        UsageError: something else than demonstrations.
+        IntegrityError: damaged or foreign.
+    """
+    resolved = store.resolve(ref)
+    artefact = resolved.artefact
+    if artefact is None:
+        from irlcli.data.demonstrations import read_demonstrations
+
+        demos = read_demonstrations(Path(ref))
+        return source_of(resolved), demos.env, list(demos.trajectories)
+    record = artefact.manifest.record
+    if record.stage != "collect-experts" or resolved.output is not None:
+        what = resolved.output or f"a {record.stage} artefact"
+        raise UsageError(
+            f"{ref!r} is {what}, not a dataset of demonstrations",
+            "name an artefact that `irl collect-experts` made",
+        )
+    about = descriptions.parse(record.parameters, descriptions.Dataset, artefact.directory)
+    return source_of(resolved), about.env, list(about.settings)
+
+
+def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluation]:
+    """The evaluation that ``ref`` names and its summary.
+
+    Raises:
+        NotFound: no such thing.
+        UsageError: no evaluation.
+        IntegrityError: damaged.
+    """
+    artefact = store.resolve(ref).artefact
+    if artefact is None or artefact.manifest.record.stage != "evaluate":
+        raise UsageError(f"{ref!r} is no evaluation", "name artefacts that `irl evaluate` made")
+    path = store.open(artefact, _only(artefact, "summary.json"))
+    return artefact, descriptions.parse(read_json(path), descriptions.Evaluation, path)
+
+
+def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
+    """Every parameter behind an evaluation that its seeds have in common: ``STAGE.FIELD`` to value.
+
+    Without the seeds themselves, and without a lambda that was chosen for each of them. Of what
+    came from outside the store only the content is known. A reward that is not the policy's own
+    has ``reward.`` before its names.
+    """
+    found: dict[str, Any] = {}
+    pending = [(artefact, "")]
+    while pending:
+        at, prefix = pending.pop()
+        record = at.manifest.record
+        for name, value in flat(record.parameters):
+            chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
+            if name not in ("seed", "settings", "setting") and not chosen:
+                found[f"{prefix}{record.stage}.{name}"] = value
+        for role in ("policy", "reward", "demonstrations"):
+            measures = record.stage == "evaluate" and role == "reward"
+            sha = record.inputs.get(role)
+            if sha is None or (measures and by_own_reward(at, index)):
+                continue
+            makers = index.holders(sha)
+            if role == "demonstrations":
+                found[f"{prefix}{record.stage}.{role}"] = sha
+            elif makers:
+                pending.append((makers[0], "reward." if measures else prefix))
+    return found
+
+
+def by_own_reward(evaluation: Artefact, index: Index) -> bool:
+    """Whether the reward that an evaluation measured by is the one its policy was trained on."""
+    inputs = evaluation.manifest.record.inputs
+    if "reward" not in inputs or "policy" not in inputs:
+        return False
+    return any(
+        inputs["reward"] in (maker.manifest.record.inputs.get("reward"), *_contents(maker))
+        for maker in index.holders(inputs["policy"])
+    )
+
+
+def _contents(artefact: Artefact) -> list[str]:
+    return [output.sha256 for output in artefact.manifest.outputs]
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of nested parameters, by dotted name."""
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", list(value) if isinstance(value, tuple | list) else value
+
+
+def output(
+    store: Store, artefact: Artefact, name: str, form: type[descriptions.AnyForm]
+) -> descriptions.AnyForm:
+    """The JSON output ``name`` of ``artefact`` as a ``form``.
+
+    Raises:
+        NotFound: the artefact has no such output.
+        IntegrityError: damaged, or of another form.
+    """
+    path = store.open(artefact, _only(artefact, name))
+    return descriptions.convert(read_json(path), form, path)
+
+
+def _only(artefact: Artefact, name: str) -> str:
+    names = [o.path for o in artefact.manifest.outputs]
+    if name not in names:
+        raise NotFound(
+            f"artefact {artefact.id} ({artefact.manifest.record.stage}) holds no {name}",
+            f"it holds: {', '.join(names)}",
+        )
+    return name

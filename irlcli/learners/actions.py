@@ -1,0 +1,82 @@
+"""The actions that a learner sees: the policy's samples, or what the environment executes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from irlcli.trajectories import ActionSpace, Transitions
+
+
+class Policy(Protocol):
+    """What learners need of a policy: likelihoods, see :class:`irlcli.rl.policy.Policy`."""
+
+    def log_prob(
+        self, observations: torch.Tensor, actions: torch.Tensor, gradient: bool = False
+    ) -> torch.Tensor:
+        """log pi(a|s) [B]."""
+
+    def gaussian(
+        self, observations: torch.Tensor, gradient: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation [B, A]."""
+
+
+class ActionView:
+    """Actions and their log pi(a|s) as ``airl.actions`` asks for.
+
+    ``sampled``: the policy's samples, also beyond the action space's bounds. ``executed``: clipped
+    to them, so that two actions with the same effect look the same to g and have the same
+    likelihood.
+
+    Args:
+        view: ``sampled`` or ``executed``.
+        space: the environment's actions; continuous if ``executed``.
+    """
+
+    def __init__(self, view: str, space: ActionSpace):
+        self.clipped = view == "executed"
+        self._space = space
+
+    def of(self, data: Transitions) -> Transitions:
+        """``data`` with the actions that the learner sees."""
+        if not self.clipped:
+            return data
+        return replace(data, actions=np.clip(data.actions, self._space.low, self._space.high))
+
+    def log_prob(self, policy: Policy, data: Transitions, gradient: bool = False) -> torch.Tensor:
+        """log pi(a|s) [B] of transitions that :meth:`of` returned."""
+        observations = torch.as_tensor(data.observations)
+        actions = torch.as_tensor(data.actions)
+        if not self.clipped:
+            return policy.log_prob(observations, actions, gradient)
+        mean, std = policy.gaussian(observations, gradient)
+        low, high = torch.as_tensor(self._space.low), torch.as_tensor(self._space.high)
+        return clipped_log_prob(mean, std, actions, low, high)
+
+
+def clipped_log_prob(
+    mean: torch.Tensor,
+    std: torch.Tensor,
+    actions: torch.Tensor,
+    low: torch.Tensor,
+    high: torch.Tensor,
+) -> torch.Tensor:
+    """log pi [B] of a diagonal Gaussian's samples after clipping to [low, high].
+
+    Inside the bounds it is the Gaussian's density, at a bound the mass beyond it. Otherwise how far
+    an action lies beyond a bound, which has no effect, would tell the expert from the policy.
+
+    Args:
+        mean, std: of the samples, [B, A].
+        actions: clipped, [B, A].
+        low, high: the bounds, [A].
+    """
+    inside = torch.distributions.Normal(mean, std).log_prob(actions)
+    below = torch.special.log_ndtr((low - mean) / std)
+    above = torch.special.log_ndtr((mean - high) / std)
+    at_bounds = torch.where(actions <= low, below, above)
+    return torch.where((low < actions) & (actions < high), inside, at_bounds).sum(-1)

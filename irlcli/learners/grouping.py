@@ -1,0 +1,84 @@
+"""Which demonstrations share a risk: one choice of a method, independent of its penalty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Part(NamedTuple):
+    """Demonstrations of a risk that are drawn from together.
+
+    Attributes:
+        episodes: by setting, the indices of its episodes.
+        share: of the risk's samples.
+    """
+
+    episodes: dict[int, np.ndarray]
+    share: float
+
+
+class Group(NamedTuple):
+    """The demonstrations of one risk, and the risk's weight; weights sum to one."""
+
+    parts: tuple[Part, ...]
+    weight: float
+
+
+def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> list[Group]:
+    """The groups of E settings with ``counts`` [E] episodes.
+
+    - ``pooled``: one group, every episode weighted equally (ERM).
+    - ``balanced`` and ``per-setting``: one group per setting, of equal weight. Balanced groups
+      share one risk where a penalty looks at risks.
+    - ``shuffled``: as many groups, over episodes dealt out at random by ``rng``. Each setting keeps
+      the share of the total weight that it has in ``per-setting``, whatever its count.
+    """
+    settings = range(len(counts))
+    everything = {e: np.arange(counts[e]) for e in settings}
+    if grouping == "pooled":
+        return [Group((Part(everything, 1.0),), 1.0)]
+    if grouping in ("balanced", "per-setting"):
+        return [Group((Part({e: everything[e]}, 1.0),), 1.0 / len(counts)) for e in settings]
+    dealt = deal(counts, rng)
+    # Group g holds shares[g, e] of setting e, so that the columns sum to one.
+    shares = np.array([[np.mean(dealt[e] == g) for e in settings] for g in settings])
+    return [
+        Group(
+            tuple(
+                Part({e: np.flatnonzero(dealt[e] == g)}, shares[g, e] / shares[g].sum())
+                for e in settings
+                if shares[g, e] > 0.0
+            ),
+            shares[g].sum() / len(counts),
+        )
+        for g in settings
+        if shares[g].sum() > 0.0
+    ]
+
+
+def deal(counts: Sequence[int], rng: np.random.Generator) -> list[np.ndarray]:
+    """For each setting e the groups [counts[e]] of its episodes, as even as they can be.
+
+    Which episode goes to which of the E groups is random; no group stays empty.
+    """
+    groups = []
+    for setting, count in enumerate(counts):
+        dealt = np.empty(count, dtype=np.int64)
+        dealt[rng.permutation(count)] = (setting + np.arange(count)) % len(counts)
+        groups.append(dealt)
+    return groups
+
+
+def apportion(total: int, shares: Sequence[float]) -> list[int]:
+    """``total`` samples, an even number, in even parts of at least 2 close to ``shares``."""
+    pairs = total // 2
+    exact = np.asarray(shares) * pairs
+    parts = np.maximum(1, np.floor(exact).astype(int))
+    while parts.sum() < pairs:
+        parts[np.argmax(exact - parts)] += 1
+    while parts.sum() > pairs:
+        parts[np.argmax(parts)] -= 1
+    return [int(2 * part) for part in parts]

@@ -1,0 +1,107 @@
+"""Whole episodes of past policies, so that the discriminator remembers what they did."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from irlcli.trajectories import Rollout, Transitions, join
+
+
+def whole_episodes(
+    rollouts: Sequence[Rollout], worlds: np.ndarray, horizon: int
+) -> tuple[Transitions, np.ndarray]:
+    """A round's transitions [B] in ``worlds`` [N] bool, and the episode number [B] of each.
+
+    Episodes that the round's end may have cut are left out whole. The others are an unbiased
+    sample of the policy's: which ones they are depends only on when they start (Wald).
+    """
+    ended = np.concatenate([r.terminated | r.truncated for r in rollouts])
+    steps, count = ended.shape
+    kept = np.split(starts_by(ended, steps - horizon), len(rollouts))
+    before = np.zeros(ended.shape, dtype=np.int64)
+    before[1:] = np.cumsum(ended[:-1], 0)
+    # The worlds' episode numbers do not overlap.
+    numbers = np.split(before + (steps + 1) * np.arange(count), len(rollouts))
+    parts, episodes = [], []
+    for rollout, whole, number in zip(rollouts, kept, numbers, strict=True):
+        rows = whole[:, worlds].ravel()
+        parts.append(rollout.transitions(worlds, horizon).take(rows))
+        episodes.append(number[:, worlds].ravel()[rows])
+    return join(parts), np.concatenate(episodes)
+
+
+def starts_by(ended: np.ndarray, latest: int) -> np.ndarray:
+    """Steps [T, N] bool whose episode starts at step ``latest`` or before; the first always does.
+
+    ``ended`` [T, N] marks the last step of each episode; every world starts one at step 0.
+    """
+    starts = np.zeros(ended.shape, dtype=np.int64)
+    starts[1:] = np.where(ended[:-1], np.arange(1, len(ended))[:, None], 0)
+    return np.maximum.accumulate(starts) <= max(latest, 0)
+
+
+class Replay:
+    """Episodes of past rounds, for each setting.
+
+    Args:
+        settings: their number.
+        per_round: episodes that a round adds to each setting.
+        capacity: episodes kept of each setting; beyond that, random ones are dropped.
+    """
+
+    def __init__(self, settings: int, per_round: int, capacity: int):
+        self._per_round = per_round
+        self._capacity = capacity
+        self._episodes: list[list[Transitions]] = [[] for _ in range(settings)]
+
+    def add(self, setting: int, data: Transitions, episodes: np.ndarray, rng) -> None:
+        """Add some of the episodes of ``data`` [B], numbered by ``episodes`` [B]."""
+        kept = self._episodes[setting]
+        numbers = np.unique(episodes)
+        chosen = rng.choice(numbers, min(self._per_round, len(numbers)), replace=False)
+        kept += [data.take(np.flatnonzero(episodes == number)) for number in np.sort(chosen)]
+        if len(kept) > self._capacity:
+            survivors = np.sort(rng.choice(len(kept), self._capacity, replace=False))
+            self._episodes[setting] = [kept[i] for i in survivors]
+
+    def transitions(self, setting: int) -> Transitions | None:
+        """All of a setting's episodes, one after the other; None before the first round."""
+        episodes = self._episodes[setting]
+        return join(episodes) if episodes else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed run needs: per setting, joined episodes and their lengths."""
+        return {
+            "settings": [
+                {
+                    "lengths": torch.tensor([len(e) for e in episodes], dtype=torch.int64),
+                    **({} if not episodes else _tensors(join(episodes))),
+                }
+                for episodes in self._episodes
+            ]
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from ``state_dict()``."""
+        self._episodes = []
+        for stored in state["settings"]:
+            tensors = {name: t.numpy() for name, t in stored.items() if name != "lengths"}
+            ends = np.cumsum(stored["lengths"].numpy())
+            joined = Transitions(**tensors) if len(ends) else None
+            starts = [0, *ends[:-1]]
+            self._episodes.append(
+                [
+                    joined.take(np.arange(start, end))
+                    for start, end in zip(starts, ends, strict=False)
+                    if joined is not None
+                ]
+            )
+
+
+def _tensors(data: Transitions) -> dict[str, torch.Tensor]:
+    return {f.name: torch.as_tensor(getattr(data, f.name)) for f in fields(Transitions)}

@@ -1,0 +1,83 @@
+"""The reward model: g, h and the observation normaliser, as one torch module.
+
+AIRL splits what the discriminator learns into a reward g(s, a) (or g(s)) and a shaping
+potential h(s) (paper Eq. 2; Fu et al. 2017). Only g leaves adversarial training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+
+from irlcli.networks import ObservationNormaliser, mlp
+
+
+class RewardModel(nn.Module):
+    """g(s, a), h(s) and f = g + gamma h(s') - h(s) (paper Eq. 2).
+
+    Args:
+        observation_size: D.
+        action_size: A; the number of actions if they are discrete (fed as one-hot).
+        discrete: whether actions are int64 indices [B] or float32 vectors [B, A].
+        state_only: g(s) instead of g(s, a).
+        hidden: widths of the hidden layers of g and of h.
+        activation: ``tanh`` or ``relu``.
+        gamma: discount of the shaping term.
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        discrete: bool,
+        state_only: bool,
+        hidden: Sequence[int],
+        activation: str,
+        gamma: float,
+    ):
+        super().__init__()
+        self.action_size = action_size
+        self.discrete = discrete
+        self.state_only = state_only
+        self.gamma = gamma
+        self.normaliser = ObservationNormaliser(observation_size)
+        inputs = observation_size if state_only else observation_size + action_size
+        self.g = mlp(inputs, hidden, activation)
+        self.h = mlp(observation_size, hidden, activation)
+
+    def encode(self, actions: torch.Tensor) -> torch.Tensor:
+        """Actions as vectors [B, A]: one-hot if discrete."""
+        if self.discrete:
+            return nn.functional.one_hot(actions, self.action_size).float()
+        return actions
+
+    def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
+        """g [B] for observations [B, D] and encoded actions [B, A]."""
+        s = self.normaliser(observations)
+        return self.g(s if self.state_only else torch.cat([s, action_vectors], -1))[..., 0]
+
+    def forward(
+        self,
+        observations: torch.Tensor,
+        action_vectors: torch.Tensor,
+        next_observations: torch.Tensor,
+        terminated: torch.Tensor,
+    ) -> torch.Tensor:
+        """f [B]; ``terminated`` [B] in {0, 1} removes the value of the successor."""
+        h = self.h(self.normaliser(observations))[..., 0]
+        h_next = self.h(self.normaliser(next_observations))[..., 0]
+        g = self.reward(observations, action_vectors)
+        return g + self.gamma * h_next * (1.0 - terminated) - h
+
+    def absorbing_reward(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(g, f) [B] of the absorbing states in which episodes ended with ``observations`` [B, D].
+
+        An absorbing state offers no choice: its action vector is zero and log pi is zero, so
+        f = g + (gamma - 1) h.
+        """
+        none = torch.zeros(*observations.shape[:-1], self.action_size)
+        g = self.reward(observations, none)
+        h = self.h(self.normaliser(observations))[..., 0]
+        return g, g + (self.gamma - 1.0) * h

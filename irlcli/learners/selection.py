@@ -1,0 +1,86 @@
+"""Which round of adversarial training to keep, by in-distribution data that was held out.
+
+Adversarial training has no loss that falls, so the last round is not the best one. It may be
+selected by data of the settings trained on, never by the setting that a method is judged in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from irlcli.learners.actions import ActionView, Policy
+from irlcli.trajectories import Trajectory, transitions
+
+HELD_OUT_SHARE = 5  # one episode in so many, at least one
+
+
+class BestRound:
+    """Keeps the policy and the reward of the round with the highest score so far.
+
+    Args:
+        score: of a policy; higher is better.
+        learner: its reward is kept with the policy (``snapshot``, ``load_snapshot``).
+        every: rounds between two scores; the last of ``rounds`` is always scored.
+    """
+
+    def __init__(self, score: Callable[[Any], float], learner: Any, every: int, rounds: int):
+        self._score = score
+        self._learner = learner
+        self._every = every
+        self._rounds = rounds
+        self.best: dict[str, Any] = {}
+
+    def consider(self, index: int, policy: Any) -> dict[str, float]:
+        """The score of round ``index``, NaN where none is due. Of equal rounds the first is kept."""
+        if (index + 1) % self._every and index + 1 != self._rounds:
+            return {"score": float("nan")}
+        score = self._score(policy)
+        if not self.best or score > self.best["score"]:
+            self.best = {
+                "round": index,
+                "score": score,
+                "policy": {name: t.clone() for name, t in policy.state_dict().items()},
+                "reward": self._learner.snapshot(),
+            }
+        return {"score": score}
+
+    def restore(self, policy: Any) -> None:
+        """Put the best round's policy and reward back in place."""
+        policy.load_state_dict(self.best["policy"])
+        self._learner.load_snapshot(self.best["reward"])
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed run needs."""
+        return self.best
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from ``state_dict()``."""
+        self.best = dict(state)
+
+
+def hold_out(
+    episodes: Sequence[Trajectory],
+) -> tuple[Sequence[Trajectory], Sequence[Trajectory]]:
+    """One setting's episodes to train on, and those that score.
+
+    Raises:
+        ValueError: there is a single episode.
+    """
+    count = max(1, len(episodes) // HELD_OUT_SHARE)
+    if len(episodes) <= count:
+        raise ValueError("one demonstration: none can be held out")
+    return episodes[:-count], episodes[-count:]
+
+
+def log_likelihood(
+    policy: Policy, view: ActionView, held_out: Sequence[Sequence[Trajectory]]
+) -> float:
+    """Mean log pi(a|s) over the steps of ``held_out``, every setting weighted equally."""
+    means = []
+    for trajectories in held_out:
+        data = view.of(transitions(trajectories, max(len(t) for t in trajectories)))
+        means.append(float(view.log_prob(policy, data).double().mean()))
+    return float(np.mean(means))

@@ -1,0 +1,60 @@
+"""The named methods: which learner, which grouping of the demonstrations, which penalty.
+
+The command line, the experiment tables, the reports and their colours read this table; a new
+method is a line here.
+"""
+
+from typing import NamedTuple
+
+from irlcli.errors import UsageError, suggest
+
+
+class Method(NamedTuple):
+    """A named (learner, grouping, penalty).
+
+    Attributes:
+        name: as in ``--method``.
+        title: in tables and figures.
+        learner: a key of :data:`irlcli.learners.LEARNERS`. For ``train-maxent`` it is MaxEnt.
+        grouping: which demonstrations share a risk, see :class:`irlcli.configs.AIRLConfig`.
+        penalty: a key of :data:`irlcli.penalties.PENALTIES`.
+        colour: in figures. Okabe and Ito's, which colour-blind readers can tell apart.
+    """
+
+    name: str
+    title: str
+    learner: str
+    grouping: str
+    penalty: str
+    colour: str
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("erm", "AIRL-ERM", "airl", "pooled", "none", "#0072B2"),
+        Method("irm", "AIRL-IRM", "airl", "per-setting", "irmv1", "#E69F00"),
+        Method("erm-balanced", "ERM-balanced", "airl", "balanced", "none", "#009E73"),
+        Method("irm-shuffled", "IRM, labels shuffled", "airl", "shuffled", "irmv1", "#CC79A7"),
+    )
+}
+
+
+def method(name: str) -> Method:
+    """The method called ``name``.
+
+    Raises:
+        UsageError: there is no such method.
+    """
+    if name not in METHODS:
+        raise UsageError(f"unknown method {name!r}", suggest(name, METHODS))
+    return METHODS[name]
+
+
+def method_name(learner: str, grouping: str, penalty: str) -> str:
+    """The name of a combination; the combination itself where it has no name."""
+    for known in METHODS.values():
+        if (known.learner, known.grouping, known.penalty) == (learner, grouping, penalty):
+            return known.name
+    parts = [] if learner == "airl" else [learner]
+    return " ".join([*parts, grouping] + ([] if penalty == "none" else [penalty]))

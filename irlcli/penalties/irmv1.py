@@ -1,0 +1,58 @@
+"""IRMv1: the squared gradient of a setting's risk by a scale w at w = 1.
+
+Arjovsky et al. (2019), as the paper's Eqs. 4-5 and 9 use it: a predictor is invariant if no
+setting would rather rescale its output.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from irlcli.penalties import PenaltyOptions
+
+if TYPE_CHECKING:
+    import torch
+
+
+def discriminator(
+    logits: torch.Tensor, f: torch.Tensor, risks: torch.Tensor, options: PenaltyOptions
+) -> torch.Tensor:
+    """Mean over the E risks of the penalty, a scalar (see :mod:`irlcli.penalties`).
+
+    With ``scaling = "logit"`` w multiplies the whole logit, with ``"reward"`` only f: log pi is
+    not learned. The plain square is biased upwards by the variance of the batch's gradient; the
+    unbiased estimate is the product of the gradients on even and on odd samples. B must be even
+    then, and the estimate may be negative.
+    """
+    scaled = logits if options.scaling == "logit" else f
+    if not options.unbiased:
+        return (scale_gradient(logits, scaled) ** 2).mean()
+    even = scale_gradient(logits[..., ::2], scaled[..., ::2])
+    odd = scale_gradient(logits[..., 1::2], scaled[..., 1::2])
+    return (even * odd).mean()
+
+
+def scale_gradient(logits: torch.Tensor, scaled: torch.Tensor) -> torch.Tensor:
+    """d/dw BCE per risk [E] at w = 1, where d logits / dw = ``scaled`` (both [E, 2, B]).
+
+    In closed form (sigmoid(l) - y) * scaled, so that differentiating it once gives the gradient
+    of the penalty: no double backward.
+    """
+    probabilities = logits.sigmoid()
+    return 0.5 * (
+        (probabilities[:, 0] * scaled[:, 0]).mean(-1)
+        + ((probabilities[:, 1] - 1.0) * scaled[:, 1]).mean(-1)
+    )
+
+
+def occupancy(phi: np.ndarray, gap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The penalty of MaxEnt IRL [R, E], and its gradient by phi [R, E, S].
+
+    The likelihood's gradient by psi at psi = 1 is sum_s phi(s) gap(s), with ``phi`` [R, S] and
+    ``gap`` = rho_E - rho_pi [R, E, S]; this is its square (paper Eq. 9), differentiated with the
+    gap held fixed.
+    """
+    gradient_by_psi = np.einsum("rs,res->re", phi, gap)
+    return gradient_by_psi**2, 2.0 * gradient_by_psi[..., None] * gap

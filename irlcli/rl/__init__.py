@@ -1,0 +1,19 @@
+"""Reinforcement learning: the only package that knows stable-baselines3.
+
+Importing it loads neither torch nor stable-baselines3.
+"""
+
+from importlib import import_module
+from typing import Any
+
+# Name to module and class, one line each. A class takes (worlds, ppo, total_steps, seed, purpose)
+# and has what :class:`irlcli.rl.loop.Training` calls.
+ALGORITHMS = {
+    "ppo": "irlcli.rl.ppo:PPOTrainer",
+}
+
+
+def algorithm(name: str) -> Any:
+    """The trainer class called ``name``, one of :data:`ALGORITHMS`."""
+    module, _, attribute = ALGORITHMS[name].partition(":")
+    return getattr(import_module(module), attribute)

@@ -1,0 +1,209 @@
+"""Training in rounds: a policy learns from a reward source, and a learner from its rollouts.
+
+Experts, retrained policies and adversarial students differ only in what they pass here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from irlcli.rl.policy import Policy
+from irlcli.rl.ppo import PPOTrainer, RewardSource
+from irlcli.trajectories import Rollout, world_settings
+
+Row = dict[str, Any]
+State = dict[str, Any]
+
+
+class Learner(Protocol):
+    """What learns from the policy's rollouts while the policy learns."""
+
+    def begin(self, trainer: PPOTrainer) -> None:
+        """Called once, before the first round."""
+
+    def update(
+        self, index: int, rollouts: Sequence[Rollout], policy: Policy
+    ) -> list[dict[str, float]]:
+        """Learn from the rollouts of round ``index``; diagnostics, one dict per setting."""
+
+    def state_dict(self) -> State:
+        """What a resumed run needs."""
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from ``state_dict()``."""
+
+
+class Selector(Protocol):
+    """Which round's networks are kept."""
+
+    def consider(self, index: int, policy: Policy) -> dict[str, float]:
+        """Note round ``index``; diagnostics that are the same for all settings."""
+
+    def restore(self, policy: Policy) -> None:
+        """Put the networks of the chosen round back in place."""
+
+    def state_dict(self) -> State:
+        """What a resumed run needs."""
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from ``state_dict()``."""
+
+
+class NoLearner:
+    """The reward does not change: of an expert, or of a policy on a frozen reward."""
+
+    def __init__(self, settings: int):
+        self._settings = settings
+
+    def begin(self, trainer: PPOTrainer) -> None:
+        """Change nothing."""
+
+    def update(
+        self, index: int, rollouts: Sequence[Rollout], policy: Policy
+    ) -> list[dict[str, float]]:
+        """Learn nothing."""
+        return [{} for _ in range(self._settings)]
+
+    def state_dict(self) -> State:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: State) -> None:
+        """Nothing to load."""
+
+
+class LastRound:
+    """Keeps the last round."""
+
+    def consider(self, index: int, policy: Policy) -> dict[str, float]:
+        """No score."""
+        return {}
+
+    def restore(self, policy: Policy) -> None:
+        """The last round's networks are in place."""
+
+    def state_dict(self) -> State:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: State) -> None:
+        """Nothing to load."""
+
+
+class Training:
+    """A training run: its parts, the rounds done, and one row of metrics per round and setting.
+
+    Args:
+        trainer: the policy and its algorithm.
+        source: the policy's rewards.
+        learner: learns from every round's rollouts.
+        selector: chooses the round that is kept.
+        settings: of the worlds, in their order.
+    """
+
+    def __init__(
+        self,
+        trainer: PPOTrainer,
+        source: RewardSource,
+        learner: Learner,
+        selector: Selector,
+        settings: Sequence[str],
+    ):
+        self.trainer = trainer
+        self.source = source
+        self.learner = learner
+        self.selector = selector
+        self.settings = list(settings)
+        self.rounds_done = 0
+        self.rows: list[Row] = []
+
+    def run(
+        self,
+        after_round: Callable[[Training, list[Row]], None],
+        warn: Callable[[str], None],
+    ) -> list[Row]:
+        """Train to the last round and return all rows; ``after_round`` gets each round's rows."""
+        if self.rounds_done == 0:
+            self.learner.begin(self.trainer)
+        for index in range(self.rounds_done, self.trainer.rounds):
+            rollouts = self.trainer.train_round(index, self.source)
+            diagnostics = self.learner.update(index, rollouts, self.trainer.policy)
+            score = self.selector.consider(index, self.trainer.policy)
+            rows = [
+                row | of_setting | score
+                for row, of_setting in zip(
+                    episode_rows(index, self.trainer.steps, rollouts, self.settings),
+                    diagnostics,
+                    strict=True,
+                )
+            ]
+            self.rows += rows
+            self.rounds_done = index + 1
+            for message in self._errors(index, rollouts):
+                warn(message)
+            after_round(self, rows)
+        self.selector.restore(self.trainer.policy)
+        return self.rows
+
+    def _errors(self, index: int, rollouts: Sequence[Rollout]) -> list[str]:
+        """The worlds whose episode could not go on."""
+        settings = world_settings(rollouts[0].terminated.shape[1], len(self.settings))
+        return [
+            f"{self.settings[settings[world]]}, world {world}, round {index}: {error}; the episode "
+            "ended there and training continues"
+            for rollout in rollouts
+            for world, error in rollout.errors
+        ]
+
+    def state_dict(self) -> State:
+        """What a resumed run needs, besides the rows."""
+        return {
+            "trainer": self.trainer.state_dict(),
+            "learner": self.learner.state_dict(),
+            "selector": self.selector.state_dict(),
+            "rounds_done": self.rounds_done,
+        }
+
+    def load_state_dict(self, state: State, rows: Sequence[Row]) -> None:
+        """Continue from ``state_dict()`` and the ``rows`` of that moment."""
+        self.trainer.load_state_dict(state["trainer"])
+        self.learner.load_state_dict(state["learner"])
+        self.selector.load_state_dict(state["selector"])
+        self.rounds_done = int(state["rounds_done"])
+        self.rows = list(rows)
+
+
+def episode_rows(
+    index: int, steps: int, rollouts: Sequence[Rollout], settings: Sequence[str]
+) -> list[Row]:
+    """One row per setting: true return and length of the episodes that ended in this round.
+
+    Where no episode ended the values are NaN, not zero; so is the progress of an environment that
+    reports none.
+    """
+    of_world = world_settings(rollouts[0].terminated.shape[1], len(settings))
+    rows = []
+    for number, setting in enumerate(settings):
+        worlds = of_world == number
+        ended = np.concatenate([(r.lengths[:, worlds] > 0).ravel() for r in rollouts])
+
+        def mean(field: str, worlds=worlds, ended=ended) -> float:
+            values = np.concatenate([getattr(r, field)[:, worlds].ravel() for r in rollouts])[ended]
+            return float(values.mean()) if len(values) else float("nan")
+
+        rows.append(
+            {
+                "round": index,
+                "steps": steps,
+                "setting": setting,
+                "episodes": int(ended.sum()),
+                "true_return": mean("returns"),
+                "progress": mean("progress"),
+                "episode_length": mean("lengths"),
+                "terminated": mean("terminated"),
+            }
+        )
+    return rows

@@ -1,0 +1,132 @@
+"""Policies: SB3's actor-critic network, and how one is described, saved and rebuilt."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+from irlcli.configs import PPOConfig
+from irlcli.data.descriptions import PolicyNetwork
+from irlcli.envs.registration import make
+from irlcli.errors import UsageError
+from irlcli.interventions import Setting
+from irlcli.networks import ACTIVATIONS, ObservationNormaliser
+
+# Categorical re-checks its support on every one of millions of calls. SB3 builds it from logits
+# that are finite, or the run has failed already.
+torch.distributions.Distribution.set_default_validate_args(False)
+
+
+class NormalisingExtractor(FlattenExtractor):
+    """SB3's features extractor that normalises observations by running moments."""
+
+    def __init__(self, observation_space: gymnasium.Space):
+        super().__init__(observation_space)
+        self.normaliser = ObservationNormaliser(self.features_dim)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Normalised observations [B, D] float32."""
+        return self.normaliser(observations)
+
+
+def extractor(normalising: bool) -> type[FlattenExtractor]:
+    """The features extractor of a policy that does, or does not, normalise observations."""
+    return NormalisingExtractor if normalising else FlattenExtractor
+
+
+class Policy:
+    """A stochastic policy pi(a|s), as SB3's actor-critic network.
+
+    For a policy trained with gSDE this is the distribution of a single action: its noise is drawn
+    anew at every step, while in training it is held for ``sde_sample_freq`` steps.
+    """
+
+    def __init__(self, network: ActorCriticPolicy):
+        self.network = network
+
+    def act(self, observations: np.ndarray, deterministic: bool = False) -> np.ndarray:
+        """Actions [N] or [N, A] for observations [N, D]; samples by torch's global generator."""
+        with torch.no_grad():
+            distribution = self.network.get_distribution(torch.as_tensor(observations))
+            actions = distribution.mode() if deterministic else distribution.distribution.sample()
+            return actions.numpy()
+
+    def log_prob(
+        self, observations: torch.Tensor, actions: torch.Tensor, gradient: bool = False
+    ) -> torch.Tensor:
+        """log pi(a|s) [B] for observations [B, D] and actions [B] or [B, A]."""
+        with torch.set_grad_enabled(gradient):
+            return self.network.get_distribution(observations).log_prob(actions)
+
+    def gaussian(
+        self, observations: torch.Tensor, gradient: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation [B, A] of pi(.|s) for observations [B, D]."""
+        with torch.set_grad_enabled(gradient):
+            distribution = self.network.get_distribution(observations).distribution
+            return distribution.mean, distribution.stddev
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The network's tensors."""
+        return self.network.state_dict()
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Replace the network's tensors."""
+        self.network.load_state_dict(state)
+
+
+def describe(ppo: PPOConfig) -> PolicyNetwork:
+    """What :func:`load_policy` needs besides the tensors and a setting."""
+    return PolicyNetwork(
+        net_arch=ppo.net_arch,
+        activation=ppo.activation,
+        normalise_observations=ppo.normalise_observations,
+        use_sde=ppo.use_sde,
+    )
+
+
+def load_policy(
+    env: str, setting: Setting, description: PolicyNetwork, state: dict[str, torch.Tensor]
+) -> Policy:
+    """The policy that :func:`describe` and ``Policy.state_dict`` wrote down.
+
+    ``setting`` is one it was trained in: a goal, for example, extends the observation.
+
+    Raises:
+        RuntimeError: the description and the tensors do not fit each other.
+    """
+    torch.set_num_threads(1)
+    world = make(env, setting)
+    network = ActorCriticPolicy(
+        world.observation_space,
+        world.action_space,
+        lambda _: 0.0,
+        net_arch=list(description.net_arch),
+        activation_fn=ACTIVATIONS[description.activation],
+        # The tensors below replace the first weights, whatever they are.
+        ortho_init=False,
+        features_extractor_class=extractor(description.normalise_observations),
+        use_sde=description.use_sde,
+    )
+    world.close()
+    network.load_state_dict(state)
+    network.set_training_mode(False)
+    return Policy(network)
+
+
+def require_observations(policy: Policy, space: gymnasium.Space, where: str) -> None:
+    """Check that ``policy`` takes the observations of ``space``, which are those of ``where``.
+
+    Raises:
+        UsageError: their sizes differ.
+    """
+    size = policy.network.observation_space.shape[0]
+    if space.shape[0] != size:
+        raise UsageError(
+            f"the policy takes observations of size {size}, but {where} has size {space.shape[0]}",
+            "a goal (goal-y, direction) is part of the observation: name a setting with the same "
+            "kind of intervention as in training",
+        )

@@ -1,0 +1,114 @@
+"""Whole episodes of a policy, or of an agent that learns nothing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from irlcli.envs.registration import make
+from irlcli.envs.registry import environment
+from irlcli.interventions import Setting
+from irlcli.rl.policy import Policy, require_observations
+from irlcli.seeds import derive
+from irlcli.trajectories import Trajectory
+
+
+def roll_out(
+    env: str,
+    setting: Setting,
+    policy: Policy | str,
+    episodes: int,
+    seed: int,
+    purpose: str,
+    deterministic: bool = False,
+    parallel: int = 16,
+) -> list[Trajectory]:
+    """``episodes`` whole episodes of ``policy`` (or ``"random"``, ``"idle"``) in one setting.
+
+    Episode k starts from a state of its own, derived from (purpose, seed, k). The actions of
+    the ``parallel`` episodes that run together come from one generator.
+
+    Raises:
+        UsageError: the setting's observations are not those the policy was trained on.
+    """
+    torch.set_num_threads(1)
+    limit = environment(env).max_episode_steps
+    trajectories: list[Trajectory] = []
+    for first in range(0, episodes, parallel):
+        batch = range(first, min(first + parallel, episodes))
+        seeds = [derive(purpose, seed, k)[0] for k in batch]
+        torch.manual_seed(seeds[0])
+        rng = np.random.default_rng(seeds[0])
+        worlds = [make(env, setting) for _ in batch]
+        if isinstance(policy, Policy):
+            require_observations(policy, worlds[0].observation_space, f"{env} {setting}")
+        trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, rng)
+        for world in worlds:
+            world.close()
+    return trajectories
+
+
+def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Trajectory]:
+    observations = [[w.reset(seed=s)[0]] for w, s in zip(worlds, seeds, strict=True)]
+    actions: list[list[Any]] = [[] for _ in worlds]
+    rewards: list[list[float]] = [[] for _ in worlds]
+    progress = [math.nan for _ in worlds]
+    errors: list[str | None] = [None for _ in worlds]
+    ends = [(False, False)] * len(worlds)
+    active = list(range(len(worlds)))
+    space = worlds[0].action_space
+    while active:
+        current = np.stack([observations[i][-1] for i in active])
+        if isinstance(policy, Policy):
+            chosen = policy.act(current, deterministic)
+        elif policy == "random":
+            chosen = _random_actions(space, len(active), rng)
+        else:
+            chosen = _idle_actions(space, len(active))
+        still = []
+        for i, action in zip(active, chosen, strict=True):
+            observation, reward, terminated, truncated, info = worlds[i].step(action)
+            if "progress" in info:
+                progress[i] = (progress[i] if rewards[i] else 0.0) + info["progress"]
+            errors[i] = info.get("error")
+            observations[i].append(np.asarray(observation, dtype=np.float32))
+            actions[i].append(action)
+            rewards[i].append(float(reward))
+            truncated = truncated or len(rewards[i]) >= limit
+            ends[i] = (bool(terminated), bool(truncated and not terminated))
+            if not (terminated or truncated):
+                still.append(i)
+        active = still
+    return [
+        Trajectory(
+            observations=np.stack(observations[i]),
+            actions=np.asarray(actions[i], dtype=_action_dtype(space)),
+            rewards=np.asarray(rewards[i], dtype=np.float64),
+            terminated=ends[i][0],
+            truncated=ends[i][1],
+            seed=seeds[i],
+            progress=progress[i],
+            error=errors[i],
+        )
+        for i in range(len(worlds))
+    ]
+
+
+def _action_dtype(space: gymnasium.Space) -> type:
+    return np.int64 if isinstance(space, gymnasium.spaces.Discrete) else np.float32
+
+
+def _random_actions(space: gymnasium.Space, count: int, rng: np.random.Generator) -> np.ndarray:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return rng.integers(space.n, size=count)
+    return rng.uniform(space.low, space.high, size=(count, *space.shape)).astype(np.float32)
+
+
+def _idle_actions(space: gymnasium.Space, count: int) -> np.ndarray:
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return np.zeros(count, dtype=np.int64)
+    return np.zeros((count, *space.shape), dtype=np.float32)

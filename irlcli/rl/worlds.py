@@ -1,0 +1,99 @@
+"""The environments that a policy is trained in, and the view of them that SB3 steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from irlcli.envs.registration import make
+from irlcli.envs.registry import environment
+from irlcli.envs.vector import Ended, VectorWorlds
+from irlcli.envs.workers import WorkerWorlds
+from irlcli.interventions import Setting
+from irlcli.trajectories import ActionSpace, world_settings
+
+Worlds = VectorWorlds | WorkerWorlds
+
+
+def make_worlds(env: str, settings: Sequence[Setting], count: int, workers: int = 1) -> Worlds:
+    """``count`` worlds in equal shares of each setting, see :func:`world_settings`.
+
+    More than one worker (at most one per world) steps them in as many processes, with the same
+    results.
+    """
+    factories = [
+        partial(make, env, settings[index]) for index in world_settings(count, len(settings))
+    ]
+    limit = environment(env).max_episode_steps
+    if min(workers, count) > 1:
+        return WorkerWorlds(factories, limit, min(workers, count))
+    return VectorWorlds([factory() for factory in factories], limit)
+
+
+def action_space(space: gymnasium.Space) -> ActionSpace:
+    """What learners need to know of ``space``."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return ActionSpace(True, int(space.n), np.empty(0), np.empty(0))
+    return ActionSpace(False, space.shape[0], space.low, space.high)
+
+
+class RecordingVecEnv(VecEnv):
+    """The worlds as SB3 steps them, and a record of what SB3's rollout buffer drops."""
+
+    def __init__(self, worlds: Worlds):
+        self.worlds = worlds
+        super().__init__(len(worlds), worlds.observation_space, worlds.action_space)
+        self.seeds: Sequence[int] = range(len(worlds))
+        self.rewards: list[np.ndarray] = []
+        self.ended: list[tuple[int, Ended]] = []
+        self._actions: np.ndarray | None = None
+        self._no_infos: list[dict[str, Any]] = [{} for _ in range(len(worlds))]
+
+    def start_recording(self) -> None:
+        """Forget what was recorded."""
+        self.rewards, self.ended = [], []
+
+    def reset(self) -> np.ndarray:
+        """Start fresh episodes from ``seeds``; observations [N, D]."""
+        return self.worlds.reset(self.seeds)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        observations, rewards, ended = self.worlds.step(self._actions)
+        dones = np.zeros(self.num_envs, dtype=bool)
+        infos = self._no_infos
+        if ended:
+            infos = list(self._no_infos)
+            for end in ended:
+                self.ended.append((len(self.rewards), end))
+                dones[end.world] = True
+                infos[end.world] = {
+                    "terminal_observation": end.final_observation,
+                    "TimeLimit.truncated": not end.terminated,
+                }
+        self.rewards.append(rewards)
+        # SB3 adds the bootstrapped value of truncated steps to the array that it receives.
+        return observations, rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        self.worlds.close()
+
+    def get_attr(self, attr_name, indices=None):
+        # SB3 asks for the render mode. Nothing is drawn in training.
+        return [None for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise AttributeError("training worlds may live in other processes")
+
+    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
+        raise AttributeError("training worlds may live in other processes")
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False for _ in self._get_indices(indices)]

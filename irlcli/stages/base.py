@@ -1,0 +1,179 @@
+"""Stages: pure functions from (parameters, input artefacts) to an output directory.
+
+A :class:`Request` says what is wanted; the runner finds it in the store or makes it. Planning
+and cache hits import every stage module, so each imports torch, gymnasium, pyarrow and the like
+inside ``run`` only.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import msgspec
+
+from irlcli.envs.registry import environment
+from irlcli.store import Artefact
+
+if TYPE_CHECKING:
+    from irlcli.rl.loop import Row, Training
+    from irlcli.trajectories import Trajectory
+
+
+class Console(Protocol):
+    """What a stage may tell the user."""
+
+    def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
+        """How far the work is; ``facts`` are shown beside it."""
+
+    def warn(self, message: str) -> None:
+        """Something that the user must see."""
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Metrics of one round, for a mirror such as TensorBoard."""
+
+
+class Checkpoints(Protocol):
+    """Where a stage keeps what it needs to resume after being killed."""
+
+    def load(self) -> bytes | None:
+        """The last state saved for this key, or None."""
+
+    def offer(self, state: Callable[[], bytes]) -> None:
+        """Called at the end of every round: saves ``state()`` if a checkpoint is due.
+
+        Raises:
+            Interrupted: the user asked to stop; the state has been saved.
+        """
+
+
+class Job(NamedTuple):
+    """What a stage works with: inputs by role (files or directories), and where to write.
+
+    ``workers`` processes may step the environments; results do not depend on it.
+    """
+
+    parameters: Any
+    inputs: Mapping[str, Path]
+    output: Path
+    checkpoints: Checkpoints
+    console: Console
+    workers: int = 1
+
+    def warn_of_errors(self, setting: str, trajectories: Sequence[Trajectory]) -> None:
+        """Name the episodes that could not go on."""
+        for k, trajectory in enumerate(trajectories):
+            if trajectory.error is not None:
+                self.console.warn(f"{setting}, episode {k}: {trajectory.error}; it ended there")
+
+
+class Stage(NamedTuple):
+    """A kind of work. A change that alters results must raise ``version``."""
+
+    name: str
+    version: int
+    run: Callable[[Job], None]
+
+
+class Source(NamedTuple):
+    """An input that exists: a file or an artefact's directory, known by its content's sha256.
+
+    ``artefact`` is where it lives in the store; None for a path outside it.
+    """
+
+    path: Path
+    sha256: str
+    artefact: Artefact | None = None
+
+
+class From(NamedTuple):
+    """An input that another request makes: one of its outputs, or all of them (``None``)."""
+
+    request: Request
+    output: str | None = None
+
+
+class Request(NamedTuple):
+    """A stage with its parameters and inputs, all that its key depends on.
+
+    ``parameters`` is a msgspec Struct; every field of it is part of the identity. ``label``
+    is what the user sees.
+    """
+
+    stage: Stage
+    parameters: msgspec.Struct
+    inputs: Mapping[str, Source | From]
+    label: str
+
+
+class EnvironmentKey(msgspec.Struct, frozen=True, kw_only=True):
+    """What a key holds of an environment: a change of its physics or horizon changes the key."""
+
+    name: str
+    physics: int
+    max_episode_steps: int
+
+
+def environment_key(env: str) -> EnvironmentKey:
+    """The key of the environment called ``env``.
+
+    Raises:
+        UsageError: unknown environment.
+    """
+    spec = environment(env)
+    return EnvironmentKey(
+        name=spec.name, physics=spec.physics, max_episode_steps=spec.max_episode_steps
+    )
+
+
+def run_training(job: Job, training: Training) -> list[Row]:
+    """Run ``training`` from the job's last checkpoint to the end; its rows.
+
+    Reports every round to the job's console and offers it as a checkpoint.
+
+    Raises:
+        IntegrityError: the checkpoint holds a state that does not fit this training.
+    """
+    from irlcli.data import tensors
+
+    state = tensors.restore(job.checkpoints.load(), {"training", "rows"}, job.console.warn)
+    if state is not None:
+        # A crafted state can make torch and Python raise anything.
+        with tensors.fitting(job.output.parent, Exception):
+            rows = json.loads(state["rows"].numpy().tobytes())
+            training.load_state_dict(state["training"], rows)
+
+    def encoded() -> bytes:
+        # Rows as one tensor: they grow with the rounds, the number of tensors does not.
+        rows = tensors.byte_tensor(json.dumps(training.rows).encode())
+        return tensors.to_bytes({"training": training.state_dict(), "rows": rows})
+
+    def after_round(_: Training, newest: list[Row]) -> None:
+        _report(job, training, newest)
+        job.checkpoints.offer(encoded)
+
+    return training.run(after_round, job.console.warn)
+
+
+def shown(true_return: float, progress: float | None) -> str:
+    """A true return for the user, with the environment's progress if it reports one."""
+    no_progress = progress is None or progress != progress
+    return f"return {true_return:.0f}" + ("" if no_progress else f" progress {progress:.0f}")
+
+
+def _report(job: Job, training: Training, newest: list[Row]) -> None:
+    facts = {row["setting"]: shown(row["true_return"], row["progress"]) for row in newest}
+    if "accuracy" in newest[0]:
+        accuracy = sum(row["accuracy"] for row in newest) / len(newest)
+        facts["discriminator"] = f"accuracy {accuracy:.2f}"
+    trainer = training.trainer
+    job.console.progress(trainer.steps, trainer.rounds * trainer.steps_per_round, "steps", facts)
+    scalars = {
+        f"{row['setting']}/{name}": float(value)
+        for row in newest
+        for name, value in row.items()
+        if name not in ("round", "steps", "setting")
+    }
+    job.console.scalars(trainer.steps, scalars)
