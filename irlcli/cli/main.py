@@ -508,7 +508,7 @@ class _Reward(NamedTuple):
     @property
     def arguments(self) -> dict[str, Any]:
         """Those of ``evaluate.request``."""
-        return {"reward": self.source, "learned": _learned_text(self.origin)}
+        return {"reward": self.source, "reward_label": _learned_text(self.origin)}
 
 
 def _reward(session: Session, ref: str, env: str | None) -> _Reward:
@@ -540,7 +540,7 @@ def _evaluate_policy(session, policy, where, env, episodes, seed, learned, name)
     if origin.agent != "expert":
         who = _joined([origin.agent, origin.method, f"of seed {origin.seed}"])
     request = evaluate.request(
-        origin.env, settings, config.evaluation, source, seed=seed, who=who, **by
+        origin.env, settings, config.evaluation, source, seed=seed, policy_label=who, **by
     )
     return session.deliver([request], name)
 
@@ -583,7 +583,7 @@ def _evaluate_agent(session, agent, trained_in, where, env, episodes, seed, lear
             config.evaluation,
             From(train_expert.request(env, own, 0, config.expert_of(own)), "policy.pt"),
             seed=seed,
-            who=f"expert of {own}",
+            policy_label=f"expert of {own}",
             **by,
         )
         for own, measured in wanted
