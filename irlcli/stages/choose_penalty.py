@@ -1,70 +1,97 @@
-"""lambda by leaving one training setting out (method: model selection that touches no OOD data)."""
+"""lambda by leaving one training setting out: model selection that touches no OOD setting."""
 
 from collections.abc import Sequence
 
 import msgspec
 
-from irlcli.configs import PENALISED, AIRLConfig
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.configs import AIRLConfig, EvaluationConfig
+from irlcli.errors import UsageError
 from irlcli.interventions import Setting
-from irlcli.stages import train_airl
-from irlcli.stages.base import From, Job, Request, Source, Stage
+from irlcli.stages import evaluate, train_airl
+from irlcli.stages.base import (
+    EnvironmentKey,
+    From,
+    Job,
+    Request,
+    Source,
+    Stage,
+    environment_key,
+)
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What the choice depends on, besides the rewards learned for it."""
+    """What the choice depends on, besides the evaluations that it compares."""
 
-    env: str
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     weights: tuple[float, ...]
     seed: int
 
 
 class Choice(msgspec.Struct, frozen=True, kw_only=True):
-    """``choice.json``: the mean true return in each setting left out, and what follows."""
+    """``choice.json``: the mean true return in each left-out setting, and the weight chosen.
+
+    ``scores`` has one dict per weight, from the left-out setting to the true return.
+    """
 
     env: str
     weights: tuple[float, ...]
-    scores: tuple[dict[str, float], ...]  # of each weight: left-out setting to true return
+    scores: tuple[dict[str, float], ...]
     chosen: float
 
 
 def request(
     demos: Source | From,
     env: str,
-    settings_: Sequence[Setting],
+    settings: Sequence[Setting],
     airl: AIRLConfig,
+    evaluation: EvaluationConfig,
     weights: Sequence[float],
     seed: int = 0,
 ) -> Request:
     """The one of ``weights`` whose students do best in the settings left out, on average.
 
-    For each weight and setting, ``airl`` is trained on the other settings and scored by its best
-    round's true return in the one left out. Outputs ``choice.json``.
+    For each weight and setting, ``airl`` is trained on the other settings, and the student that
+    ``airl.select`` keeps is evaluated in the one left out: what is scored is what is deployed.
+    Outputs ``choice.json``.
 
     Raises:
-        UsageError: fewer than two settings or weights, a method without penalty.
+        UsageError: fewer than two settings or weights, a method without penalty, or a round that
+            is selected by one of the settings.
     """
-    texts = tuple(str(s) for s in settings_)
+    texts = tuple(str(s) for s in settings)
     candidates = tuple(sorted(set(weights)))
     if len(texts) < 2:
         raise UsageError(
-            f"{texts[0]} is the only setting: none can be left out", "set lambda by hand"
+            f"{texts[0]} is the only setting, so none can be left out", "give --penalty-weight"
         )
     if len(candidates) < 2:
-        raise UsageError("one lambda is no choice", "name at least two: --choose-penalty 0.1,1,10")
-    if airl.method not in PENALISED:
         raise UsageError(
-            f"method {airl.method!r} has no penalty", f"one of: {', '.join(PENALISED)}"
+            "--choose-penalty needs at least two candidates", "for example --choose-penalty 0.1,1,10"
+        )
+    if airl.penalty == "none":
+        raise UsageError("this method has no penalty to weigh", "--method irm has one")
+    if airl.select in texts:
+        raise UsageError(
+            f"--choose-penalty leaves every setting out in turn, also {airl.select}",
+            "select the last round, or by episodes",
         )
     inputs = {}
     for weight in candidates:
-        for text in texts:
-            config = msgspec.structs.replace(airl, penalty_weight=weight, select=text)
-            learned = train_airl.request(demos, env, settings_, config, seed)
-            inputs[_role(weight, text)] = From(learned, "reward.json")
-    parameters = Parameters(env=env, settings=texts, weights=candidates, seed=seed)
-    label = f"choose-penalty {airl.method} {env} {', '.join(texts)} seed {seed}"
+        config = msgspec.structs.replace(airl, penalty_weight=weight)
+        for left_out in settings:
+            others = [s for s in settings if s != left_out]
+            learned = train_airl.request(demos, env, others, config, seed)
+            student = From(learned, "policy.pt")
+            label = f"student of {train_airl.describe(config)} seed {seed}"
+            measured = evaluate.request(
+                env, [left_out], evaluation, student, seed=seed, policy_label=label
+            )
+            inputs[_role(weight, str(left_out))] = From(measured, "summary.json")
+    parameters = Parameters(
+        environment=environment_key(env), settings=texts, weights=candidates, seed=seed
+    )
+    label = f"choose-penalty {train_airl.name(airl)} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, inputs, label)
 
 
@@ -73,7 +100,7 @@ def _role(weight: float, setting: str) -> str:
 
 
 def run(job: Job) -> None:
-    """Read the scores; of weights that tie, the smallest is chosen."""
+    """Compare the mean scores; of weights that tie, the smallest is chosen."""
     import json
 
     from irlcli.data import descriptions
@@ -85,15 +112,19 @@ def run(job: Job) -> None:
         row = {}
         for text in p.settings:
             path = job.inputs[_role(weight, text)]
-            learned = descriptions.parse(json.loads(path.read_text()), descriptions.Reward, path)
-            if learned.selected is None:
-                raise IntegrityError(f"{path} says of no round that it was selected")
-            row[text] = learned.selected.score
+            summary = descriptions.parse(
+                json.loads(path.read_text()), descriptions.Evaluation, path
+            )
+            row[text] = summary.settings[0].mean_return
         scores.append(row)
     means = [sum(row.values()) / len(row) for row in scores]
-    chosen = p.weights[means.index(max(means))]
-    choice = Choice(env=p.env, weights=p.weights, scores=tuple(scores), chosen=chosen)
+    choice = Choice(
+        env=p.environment.name,
+        weights=p.weights,
+        scores=tuple(scores),
+        chosen=p.weights[means.index(max(means))],
+    )
     write_json(job.output / "choice.json", msgspec.to_builtins(choice))
 
 
-STAGE = Stage("choose-penalty", 1, run)
+STAGE = Stage("choose-penalty", 2, run)

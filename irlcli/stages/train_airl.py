@@ -40,7 +40,7 @@ def request(
     seed: int = 0,
     basis: Mapping[str, Source | From] | None = None,
 ) -> Request:
-    """A reward and a student learned from ``demos``, recorded in ``settings`` of ``env``.
+    """A reward and a student learned from those of ``demos`` that are of ``settings``.
 
     ``basis`` are further artefacts that the parameters follow from: part of the lineage.
 
@@ -77,9 +77,14 @@ def request(
     return Request(STAGE, parameters, {"demonstrations": demos, **(basis or {})}, label)
 
 
+def name(airl: AIRLConfig) -> str:
+    """The method's name."""
+    return method_name(airl.learner, airl.grouping, airl.penalty)
+
+
 def describe(airl: AIRLConfig) -> str:
     """The method in a label: its name, lambda, and what else sets it apart."""
-    parts = [method_name(airl.learner, airl.grouping, airl.penalty)]
+    parts = [name(airl)]
     if airl.penalty != "none":
         parts.append(f"lambda {airl.penalty_weight:g}")
     if airl.select != "last":
@@ -123,10 +128,10 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, airl = p.environment.name, p.airl
     demos = read_demonstrations(job.inputs["demonstrations"])
-    if demos.env != env or tuple(demos.trajectories) != p.settings:
+    if demos.env != env or not set(p.settings) <= set(demos.trajectories):
         raise IntegrityError(
-            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, not of "
-            f"{env} {', '.join(p.settings)}"
+            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, but "
+            f"{env} {', '.join(p.settings)} is asked for"
         )
     settings = _trained(airl, p.settings)
     episodes = [demos.trajectories[text] for text in settings]
@@ -177,7 +182,7 @@ def run(job: Job) -> None:
     origin = {
         "env": env,
         "settings": settings,
-        "method": method_name(airl.learner, airl.grouping, airl.penalty),
+        "method": name(airl),
         "seed": p.seed,
     }
     write_policy(job.output, trainer.policy, airl.ppo, agent="student", **origin)
