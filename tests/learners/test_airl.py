@@ -7,12 +7,25 @@ import pytest
 import scipy.stats
 import torch
 
+from irlcli.configs import AIRLConfig
 from irlcli.envs.lunar_lander.env import LunarLander
 from irlcli.learners import airl
-from irlcli.learners.reward_model import Normaliser, RewardModel
-from irlcli.trajectories import Transitions, join
+from irlcli.learners.actions import clipped_log_prob
+from irlcli.learners.pools import Pool, Stratum, join_pools, make_pool, sample_minibatch
+from irlcli.learners.reward_model import RewardModel
+from irlcli.networks import ObservationNormaliser
+from irlcli.penalties import PenaltyOptions
+from irlcli.trajectories import ActionSpace, Trajectory, Transitions, join
 
 GAMMA = 0.9
+EPISODE = Trajectory(
+    observations=np.arange(80, dtype=np.float32).reshape(10, 8),
+    actions=np.arange(9) % 4,
+    rewards=np.zeros(9),
+    terminated=False,
+    truncated=True,
+    seed=0,
+)
 
 
 def make_model(state_only=False, discrete=True, seed=0):
@@ -127,7 +140,7 @@ def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
     model = make_model()
     data = make_transitions(10, terminated=[3, 7], remaining=6)
     log_probs = -torch.rand(10)
-    pool = airl.make_pool(model, data, log_probs, absorbing=True)
+    pool = make_pool(model, data, log_probs, absorbing=True)
     counts = torch.bincount(pool.draw, minlength=12)
     assert counts.tolist() == [1] * 10 + [6, 6]
     assert pool.terminated.sum() == 0
@@ -135,7 +148,7 @@ def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
     assert pool.log_probs[10:].tolist() == [0.0, 0.0]
     np.testing.assert_array_equal(pool.observations[10].numpy(), data.next_observations[3])
 
-    plain = airl.make_pool(model, data, log_probs, absorbing=False)
+    plain = make_pool(model, data, log_probs, absorbing=False)
     assert plain.draw.tolist() == list(range(10))
     assert plain.terminated.sum() == 2
 
@@ -143,8 +156,8 @@ def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
 def test_join_pools_keeps_rows_and_weights():
     model = make_model()
     parts = [make_transitions(4, [1], 3, seed=s) for s in range(2)]
-    pools = [airl.make_pool(model, d, torch.zeros(4), True) for d in parts]
-    joined = airl.join_pools(pools)
+    pools = [make_pool(model, d, torch.zeros(4), True) for d in parts]
+    joined = join_pools(pools)
     whole = torch.cat([p.observations[p.draw] for p in pools])
     torch.testing.assert_close(joined.observations[joined.draw], whole)
 
@@ -162,16 +175,13 @@ def test_minibatch_layout_and_share_of_the_past():
                 for n in ("actions", "next_observations", "terminated", "remaining")
             ],
         )
-        return airl.make_pool(model, data, torch.zeros(20), False)
+        return make_pool(model, data, torch.zeros(20), False)
 
-    batch = airl.sample_minibatch(
-        [constant(0), constant(1)],
-        [constant(2), constant(3)],
-        8,
-        torch.Generator().manual_seed(0),
-        [constant(4), constant(5)],
-        0.25,
-    )
+    risks = [
+        [Stratum(constant(0), constant(2), (constant(4),), 8)],
+        [Stratum(constant(1), constant(3), (constant(5),), 8)],
+    ]
+    batch = sample_minibatch(risks, torch.Generator().manual_seed(0), 0.25)
     assert batch.observations.shape == (2, 2, 8, 8)
     assert batch.observations[..., 0].int().tolist() == [
         [[0] * 6 + [4] * 2, [2] * 8],
@@ -183,11 +193,44 @@ def test_minibatch_layout_and_share_of_the_past():
 def test_total_loss_is_the_papers_divided_by_lambda(weight):
     torch.manual_seed(0)
     logit, f = torch.randn(2, 2, 6), torch.randn(2, 2, 6)
-    losses = airl.discriminator_losses(logit, f, weight, "reward", unbiased=False)
-    expected = losses.cross_entropy.mean() + weight * losses.penalty.mean()
-    torch.testing.assert_close(losses.total, expected / max(1.0, weight))
-    correct = ((logit[:, 1] > 0).float().mean(-1) + (logit[:, 0] < 0).float().mean(-1)) / 2
-    torch.testing.assert_close(losses.accuracy, correct)
+    weights = torch.tensor([0.25, 0.75])
+    options = PenaltyOptions("reward", unbiased=False)
+    loss = airl.discriminator_loss(logit, f, weights, False, "irmv1", weight, options)
+    risks = airl.cross_entropy(logit)
+    assert loss.cross_entropy.item() == pytest.approx((0.25 * risks[0] + 0.75 * risks[1]).item())
+    expected = loss.cross_entropy + weight * loss.penalty
+    torch.testing.assert_close(loss.total, expected / max(1.0, weight))
+
+
+def test_a_penalty_sees_balanced_settings_as_one_risk():
+    torch.manual_seed(0)
+    logit, options = torch.randn(3, 2, 6), PenaltyOptions(unbiased=False)
+    weights = torch.full((3,), 1 / 3)
+    merged = torch.stack([logit[:, label].flatten() for label in (0, 1)])[None]
+    balanced = airl.discriminator_loss(logit, logit, weights, True, "irmv1", 1.0, options)
+    one = airl.discriminator_loss(merged, merged, torch.ones(1), False, "irmv1", 1.0, options)
+    torch.testing.assert_close(balanced.penalty, one.penalty)
+    torch.testing.assert_close(balanced.total, one.total)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0, 1000.0])
+def test_weight_decay_does_not_depend_on_lambda(weight):
+    """Where the loss has no gradient, a step shrinks every weight by learning rate times decay."""
+    config = AIRLConfig(
+        grouping="per-setting",
+        penalty="irmv1",
+        penalty_weight=weight,
+        learning_rate=0.1,
+        weight_decay=0.5,
+        hidden=(4,),
+    )
+    learner = airl.AIRL([[EPISODE]], config, 1, 9, 8, ActionSpace(True, 4, None, None), 0)
+    before = {name: p.clone() for name, p in learner.model.named_parameters()}
+    loss = sum(0.0 * p.sum() for p in learner.model.parameters()) / max(1.0, weight)
+    loss.backward()
+    learner._optimizer.step()
+    for name, parameter in learner.model.named_parameters():
+        torch.testing.assert_close(parameter, before[name] * (1 - 0.1 * 0.5))
 
 
 def test_penalty_weight_schedule():
@@ -208,7 +251,7 @@ def test_trained_discriminator_is_the_density_ratio():
         actions = torch.zeros(count, 2)
         actions[:, 0] = 1.0
         log_probs = torch.full((count,), math.log(0.5))
-        return airl.Pool(
+        return Pool(
             observations, actions, observations, torch.ones(count), log_probs, torch.arange(count)
         )
 
@@ -216,10 +259,13 @@ def test_trained_discriminator_is_the_density_ratio():
     optimizer = torch.optim.Adam(model.parameters(), lr=0.01)
     generator = torch.Generator().manual_seed(0)
     for _ in range(600):
-        batch = airl.sample_minibatch([policy], [expert], 256, generator)
-        losses = airl.discriminator_losses(*airl.logits(model, batch), 0.0)
+        batch = sample_minibatch([[Stratum(policy, expert, (), 256)]], generator)
+        logits, f = airl.discriminator_logits(model, batch)
+        loss = airl.discriminator_loss(
+            logits, f, torch.ones(1), False, "none", 0.0, PenaltyOptions()
+        )
         optimizer.zero_grad()
-        losses.total.backward()
+        loss.total.backward()
         optimizer.step()
     f = model(policy.observations, policy.actions, policy.observations, policy.terminated)
     ratio = (f - policy.log_probs).detach()
@@ -230,7 +276,7 @@ def test_trained_discriminator_is_the_density_ratio():
 def test_reward_scale_is_the_deviation_over_draws():
     model = make_model()
     data = make_transitions(12, terminated=[4], remaining=7)
-    pool = airl.make_pool(model, data, torch.zeros(12), True)
+    pool = make_pool(model, data, torch.zeros(12), True)
     with torch.no_grad():
         g = model.reward(pool.observations, pool.actions).numpy().astype(float)
     repeated = np.concatenate([g[:12], np.repeat(g[12:], 7)])
@@ -239,7 +285,7 @@ def test_reward_scale_is_the_deviation_over_draws():
 
 def test_normaliser_moments_do_not_depend_on_the_batching():
     data = torch.randn(100, 3) * torch.tensor([1.0, 5.0, 0.1]) + torch.tensor([3.0, 0.0, -7.0])
-    whole, parts = Normaliser(3), Normaliser(3)
+    whole, parts = ObservationNormaliser(3), ObservationNormaliser(3)
     whole.update(data)
     for part in data.split([1, 30, 69]):
         parts.update(part)
@@ -253,7 +299,7 @@ def test_normaliser_moments_do_not_depend_on_the_batching():
 
 
 def test_a_constant_observation_stays_finite():
-    normaliser = Normaliser(2)
+    normaliser = ObservationNormaliser(2)
     normaliser.update(torch.tensor([[1.0, 0.0], [2.0, 0.0]]))
     assert normaliser(torch.tensor([[1.5, 1.0]])).tolist() == [[0.0, 10.0]]
 
@@ -274,22 +320,22 @@ def test_clipped_log_prob_is_a_distribution_over_the_interval_and_its_ends():
         ends = torch.stack([low[k], high[k]])[:, None]
         arguments = mean[:, k : k + 1], std[:, k : k + 1]
         bounds = low[k : k + 1], high[k : k + 1]
-        tails = airl.clipped_log_prob(*arguments, ends, *bounds)
+        tails = clipped_log_prob(*arguments, ends, *bounds)
         np.testing.assert_allclose(
             tails, [normal.logcdf(float(low[k])), normal.logsf(float(high[k]))], rtol=1e-5
         )
         grid = torch.linspace(float(low[k]), float(high[k]), 100_001)[1:-1, None]
-        inside = airl.clipped_log_prob(*arguments, grid, *bounds).double().exp()
+        inside = clipped_log_prob(*arguments, grid, *bounds).double().exp()
         step = float(high[k] - low[k]) / 100_000
         assert float(inside.sum() * step + tails.double().exp().sum()) == pytest.approx(1, abs=1e-4)
-    both = airl.clipped_log_prob(mean, std, torch.tensor([[0.1, 2.0]]), low, high)
-    first = airl.clipped_log_prob(mean[:, :1], std[:, :1], torch.tensor([[0.1]]), low[:1], high[:1])
-    last = airl.clipped_log_prob(mean[:, 1:], std[:, 1:], torch.tensor([[2.0]]), low[1:], high[1:])
+    both = clipped_log_prob(mean, std, torch.tensor([[0.1, 2.0]]), low, high)
+    first = clipped_log_prob(mean[:, :1], std[:, :1], torch.tensor([[0.1]]), low[:1], high[:1])
+    last = clipped_log_prob(mean[:, 1:], std[:, 1:], torch.tensor([[2.0]]), low[1:], high[1:])
     torch.testing.assert_close(both, first + last)
 
 
 def test_clipped_log_prob_stays_finite_far_from_the_bounds():
-    far = airl.clipped_log_prob(
+    far = clipped_log_prob(
         torch.tensor([[-8.0]]),
         torch.tensor([[0.05]]),
         torch.tensor([[1.0]]),
@@ -307,7 +353,7 @@ def test_the_entropy_of_clipped_actions_is_bounded():
     for std in (1.0, 10.0, 1000.0):
         scale = torch.full((200_000, 1), std)
         actions = (torch.randn(200_000, 1) * std).clamp(-1, 1)
-        log_probs = airl.clipped_log_prob(torch.zeros_like(scale), scale, actions, *bounds)
+        log_probs = clipped_log_prob(torch.zeros_like(scale), scale, actions, *bounds)
         entropies.append(-float(log_probs.mean()))
     assert entropies[2] == pytest.approx(np.log(2), abs=0.01)
     # The interval and its two ends weigh four: no distribution over them has more.

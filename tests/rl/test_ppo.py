@@ -7,7 +7,10 @@ import torch
 from irlcli.configs import PPOConfig
 from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.interventions import parse_settings
-from irlcli.rl import ppo as rl
+from irlcli.rl.policy import describe, load_policy
+from irlcli.rl.ppo import PPOTrainer, TrueReward
+from irlcli.rl.rollout import roll_out
+from irlcli.rl.worlds import make_worlds
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.25x")
 PPO = PPOConfig(n_envs=4, n_steps=128, batch_size=128, n_epochs=2, rollouts_per_round=2)
@@ -15,10 +18,20 @@ PPO = PPOConfig(n_envs=4, n_steps=128, batch_size=128, n_epochs=2, rollouts_per_
 
 def make_trainer(seed=0, limit=None, **changes):
     ppo = PPOConfig(**{**{f: getattr(PPO, f) for f in PPO.__struct_fields__}, **changes})
-    worlds = rl.make_worlds("lunar-lander", SETTINGS, ppo.n_envs)
+    worlds = make_worlds("lunar-lander", SETTINGS, ppo.n_envs)
     if limit is not None:
         worlds.max_episode_steps = limit
-    return rl.PPOTrainer(worlds, ppo, 8192, seed, "test")
+    return PPOTrainer(worlds, ppo, 8192, seed, "test")
+
+
+class Reward:
+    """Rewards by a function of the rollout."""
+
+    def __init__(self, function):
+        self._function = function
+
+    def rewards(self, rollout, policy):
+        return self._function(rollout)
 
 
 def same(a, b):
@@ -38,7 +51,7 @@ def test_rollouts_hold_true_successors_and_the_sampling_policys_log_probs():
         seen.append(rollout)
         return rollout.true_rewards
 
-    trainer.train_round(0, reward)
+    trainer.train_round(0, Reward(reward))
     assert len(seen) == 2
     for rollout in seen:
         ends = rollout.terminated | rollout.truncated
@@ -56,7 +69,7 @@ def test_rollouts_hold_true_successors_and_the_sampling_policys_log_probs():
 
 
 def test_returns_are_those_of_whole_episodes():
-    rollout = make_trainer(limit=40).train_round(0)[0]
+    rollout = make_trainer(limit=40).train_round(0, TrueReward())[0]
     world = 1
     ends = np.flatnonzero(rollout.lengths[:, world])
     start = 0
@@ -70,8 +83,8 @@ def test_returns_are_those_of_whole_episodes():
 def test_training_on_true_rewards_handed_in_equals_training_on_the_environments():
     # Truncations (limit 50) and terminations both occur, so bootstrapping is compared as well.
     plain, replaced = make_trainer(limit=50), make_trainer(limit=50)
-    plain.train_round(0)
-    replaced.train_round(0, lambda rollout: rollout.true_rewards)
+    plain.train_round(0, TrueReward())
+    replaced.train_round(0, Reward(lambda rollout: rollout.true_rewards.copy()))
     for a, b in zip(
         plain.policy.state_dict().values(), replaced.policy.state_dict().values(), strict=True
     ):
@@ -81,7 +94,7 @@ def test_training_on_true_rewards_handed_in_equals_training_on_the_environments(
 def test_same_seed_same_bytes_other_seed_other_bytes():
     a, b, c = make_trainer(1), make_trainer(1), make_trainer(2)
     for trainer in (a, b, c):
-        trainer.train_round(0)
+        trainer.train_round(0, TrueReward())
     assert same(a, b)
     assert not same(a, c)
 
@@ -89,13 +102,13 @@ def test_same_seed_same_bytes_other_seed_other_bytes():
 def test_a_resumed_trainer_equals_an_uninterrupted_one():
     through, first = make_trainer(), make_trainer()
     for index in range(3):
-        through.train_round(index)
-    first.train_round(0)
+        through.train_round(index, TrueReward())
+    first.train_round(0, TrueReward())
     stored = to_bytes(first.state_dict())
     resumed = make_trainer()
     resumed.load_state_dict(from_bytes(stored))
     for index in (1, 2):
-        resumed.train_round(index)
+        resumed.train_round(index, TrueReward())
     assert same(through, resumed)
     assert resumed.steps == 3 * resumed.steps_per_round
 
@@ -106,7 +119,7 @@ def test_linear_schedules_fall_to_zero():
     )
     rates = []
     for index in range(trainer.rounds):
-        trainer.train_round(index)
+        trainer.train_round(index, TrueReward())
         rates.append(trainer.model.policy.optimizer.param_groups[0]["lr"])
     assert rates == sorted(rates, reverse=True)
     assert rates[-1] == pytest.approx(0.0)
@@ -115,9 +128,9 @@ def test_linear_schedules_fall_to_zero():
 
 def test_policies_survive_saving():
     trainer = make_trainer()
-    trainer.train_round(0)
+    trainer.train_round(0, TrueReward())
     stored = from_bytes(to_bytes(trainer.policy.state_dict()))
-    policy = rl.load_policy(rl.Policy.describe("lunar-lander", trainer.ppo), stored, SETTINGS[0])
+    policy = load_policy("lunar-lander", SETTINGS[0], describe(trainer.ppo), stored)
     observations = np.random.default_rng(0).normal(size=(20, 8)).astype(np.float32)
     np.testing.assert_array_equal(
         policy.act(observations, deterministic=True),
@@ -133,7 +146,7 @@ def test_policies_survive_saving():
 @pytest.mark.parametrize("agent", ["random", "idle"])
 def test_roll_out_is_reproducible_and_whole(agent):
     first, second = (
-        rl.roll_out("lunar-lander", SETTINGS[0], agent, 3, 5, "test", parallel=2) for _ in range(2)
+        roll_out("lunar-lander", SETTINGS[0], agent, 3, 5, "test", parallel=2) for _ in range(2)
     )
     assert len({t.seed for t in first}) == 3
     for a, b in zip(first, second, strict=True):
@@ -147,7 +160,7 @@ def test_roll_out_is_reproducible_and_whole(agent):
 def test_idle_episode_equals_gymnasiums():
     import gymnasium
 
-    (trajectory,) = rl.roll_out("lunar-lander", SETTINGS[1], "idle", 1, seed=9, purpose="test")
+    (trajectory,) = roll_out("lunar-lander", SETTINGS[1], "idle", 1, seed=9, purpose="test")
     env = gymnasium.make("irlcli/LunarLander-v0", engine_power=1.25)
     observation, _ = env.reset(seed=trajectory.seed)
     total = 0.0
@@ -164,4 +177,4 @@ def test_not_a_number_in_the_rewards_is_a_named_failure():
 
     trainer = make_trainer()
     with pytest.raises(StageFailed, match="not finite after an update in round 0"):
-        trainer.train_round(0, lambda rollout: np.full(rollout.terminated.shape, np.nan))
+        trainer.train_round(0, Reward(lambda rollout: np.full(rollout.terminated.shape, np.nan)))

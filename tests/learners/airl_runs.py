@@ -1,0 +1,41 @@
+"""Small AIRL runs that several tests share."""
+
+from msgspec.structs import replace
+
+from irlcli.configs import AIRLConfig, PPOConfig
+from irlcli.envs.registry import environment
+from irlcli.interventions import parse_settings
+from irlcli.learners.airl import AIRL
+from irlcli.rl.ppo import PPOTrainer
+from irlcli.rl.rollout import roll_out
+from irlcli.rl.worlds import action_space, make_worlds
+
+LANDER = "lunar-lander"
+SETTINGS = parse_settings(LANDER, "engine-power=1x,1.25x")
+CONFIG = AIRLConfig(updates_per_round=2, batch_size=32, ppo=PPOConfig(n_envs=8, n_steps=64))
+
+
+def random_episodes(count, env=LANDER, settings=SETTINGS):
+    """``count`` episodes of the random agent in each setting."""
+    return [roll_out(env, s, "random", count, 0, f"test {s}") for s in settings]
+
+
+def make(
+    demos, config=CONFIG, env=LANDER, settings=SETTINGS, seed=0, total_steps=10_000, **changes
+):
+    """A trainer and a learner of ``demos`` in ``settings``."""
+    config = replace(config, **changes)
+    worlds = make_worlds(env, settings[: len(demos)], config.ppo.n_envs)
+    trainer = PPOTrainer(
+        worlds, config.ppo, total_steps, seed, "test", keep_moments=config.bc_epochs > 0
+    )
+    learner = AIRL(
+        demos,
+        config,
+        worlds=len(worlds),
+        horizon=environment(env).max_episode_steps,
+        observation_size=worlds.observation_space.shape[0],
+        actions=action_space(worlds.action_space),
+        seed=seed,
+    )
+    return trainer, learner

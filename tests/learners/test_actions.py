@@ -1,0 +1,88 @@
+"""What learners see of continuous actions: samples, or what the environment executes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from airl_runs import make
+from msgspec.structs import replace as changed
+
+from irlcli.configs import AIRLConfig, PPOConfig
+from irlcli.configs.relevance import relevant_airl
+from irlcli.errors import UsageError
+from irlcli.interventions import parse_settings
+from irlcli.learners.selection import log_likelihood
+from irlcli.rl.ppo import PPOTrainer
+from irlcli.rl.rollout import roll_out
+from irlcli.rl.worlds import make_worlds
+
+REACHER = "reacher"
+SETTINGS = parse_settings(REACHER, "gravity=0.5x,2x")
+PPO = PPOConfig(n_envs=4, n_steps=160, batch_size=64, log_std_init=0.5)
+CONFIG = AIRLConfig(updates_per_round=3, batch_size=32, ppo=PPO)
+
+
+@pytest.fixture(scope="module")
+def demos():
+    worlds = make_worlds(REACHER, SETTINGS, 2)
+    policy = PPOTrainer(worlds, changed(PPO, n_envs=2), 10_000, 3, "expert").policy
+    return [roll_out(REACHER, s, policy, 3, 0, f"{s}") for s in SETTINGS]
+
+
+def further_out(demos):
+    """The same demonstrations, asking for twice as much where that does nothing more."""
+    return [
+        [replace(t, actions=np.where(abs(t.actions) > 1, 2 * t.actions, t.actions)) for t in group]
+        for group in demos
+    ]
+
+
+def learned(demos, actions, policy_reward):
+    trainer, learner = make(
+        demos, CONFIG, REACHER, SETTINGS, actions=actions, policy_reward=policy_reward
+    )
+    for index in range(2):
+        learner.update(index, trainer.train_round(index, learner), trainer.policy)
+    return trainer, learner
+
+
+def tensors(trainer, learner):
+    return {**trainer.policy.state_dict(), **learner.model.state_dict()}
+
+
+@pytest.mark.parametrize("policy_reward", ["f", "f-log-pi"])
+def test_what_lies_beyond_the_bounds_changes_nothing_that_is_learned_from_executed_actions(
+    demos, policy_reward
+):
+    once, twice = (
+        tensors(*learned(d, "executed", policy_reward)) for d in (demos, further_out(demos))
+    )
+    assert all(torch.equal(once[name], twice[name]) for name in once)
+    sampled = [tensors(*learned(d, "sampled", policy_reward)) for d in (demos, further_out(demos))]
+    assert not all(torch.equal(sampled[0][name], sampled[1][name]) for name in once)
+
+
+def test_a_policy_is_rewarded_for_the_actions_that_were_executed(demos):
+    """Where actions are sampled, noise beyond the bounds is worth a whole nat of -log pi."""
+    trainer, learner = learned(demos, "executed", "f-log-pi")
+    (rollout,) = trainer.train_round(2, learner)
+    further = replace(
+        rollout, actions=np.where(abs(rollout.actions) > 1, 9 * rollout.actions, rollout.actions)
+    )
+    assert (abs(rollout.actions) > 1).any()
+    rewards = learner.rewards(rollout, trainer.policy)
+    np.testing.assert_array_equal(rewards, learner.rewards(further, trainer.policy))
+
+
+def test_likelihoods_of_held_out_episodes_are_of_the_same_actions(demos):
+    trainer, learner = learned(demos, "executed", "f")
+    one, other = (
+        log_likelihood(trainer.policy, learner.view, d) for d in (demos, further_out(demos))
+    )
+    assert one == other
+
+
+def test_discrete_actions_have_no_bounds():
+    with pytest.raises(UsageError, match=r"airl\.actions = executed needs continuous actions"):
+        relevant_airl(AIRLConfig(actions="executed"), discrete_actions=True)
