@@ -1,7 +1,7 @@
 """Environments by setting, and their registration with gymnasium.
 
-Gymnasium calls :func:`register` by the entry point ``gymnasium.envs``, so that
-``gymnasium.make("irlcli/LunarLander-v0", bounce=0.5)`` works wherever irlcli is installed.
+Importing this module registers the environments, so that
+``gymnasium.make("irlcli/LunarLander-v0", bounce=0.5)`` works. Gymnasium 1 has no plugin entry points.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ def make(env: str, setting: Setting, render_mode: str | None = None) -> gymnasiu
     Raises:
         UsageError: unknown environment, or an intervention it does not have.
     """
-    register()
     return gymnasium.make(
         environment(env).gym_id, render_mode=render_mode, **env_kwargs(env, setting)
     ).unwrapped
+
+
+register()
