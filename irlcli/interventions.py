@@ -1,8 +1,8 @@
-"""Interventions: ``leg-length=1x,2x`` as typed settings, and which knobs an environment has.
+"""Interventions: ``leg-length=1x,2x`` as typed settings.
 
-A *setting* is one intervened environment instance (paper Sec. 4.1); a *knob* is the
-mechanism intervened on. Nothing here imports an environment: a name, the allowed values and
-the keyword argument they become are all the rest of the program needs to plan a run.
+A *setting* is one intervened environment instance (paper Sec. 4.1); a *knob* is the mechanism
+intervened on. Planning needs names, allowed values and keyword arguments only, so nothing here
+imports an environment.
 
 Grammar, per comma-separated value: ``2x`` multiplies the default, ``0.5`` is absolute,
 ``1.5:0.1:0.1`` is a triple, ``-10..0`` is drawn uniformly per episode.
@@ -18,7 +18,7 @@ from irlcli.envs.spec import Form, Knob
 from irlcli.errors import UsageError, suggest
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-# Compiled when used: every command imports this module.
+# Compiled on use: every command imports this module.
 _FORMS: dict[Form, str] = {
     "multiplier": rf"({_NUMBER})x",
     "absolute": rf"({_NUMBER})",
@@ -74,26 +74,25 @@ def _format(x: float) -> str:
 
 
 def check_tabular(env: str, stage: str, wanted: bool) -> None:
-    """Refuse an environment that ``stage`` cannot work on.
+    """Refuse an environment that ``stage`` does not work on.
 
     Raises:
-        UsageError: unknown, or tabular where ``wanted`` is false, or the other way round.
+        UsageError: unknown; or whether it is tabular differs from ``wanted``.
     """
     if environment(env).tabular == wanted:
         return
     fit = ", ".join(e.name for e in ENVIRONMENTS.values() if e.tabular == wanted)
     raise UsageError(
-        f"{stage} does not work on {env}: it is {'no' if wanted else 'a'} tabular environment",
-        f"{stage} takes {fit}; rewards of {env} come from "
-        f"`irl {'train-airl' if wanted else 'train-maxent'}`",
+        f"{stage} does not work on {env}, which {'is not' if wanted else 'is'} a tabular environment",
+        f"{stage} works on {fit}; use `irl {'train-airl' if wanted else 'train-maxent'}` for {env}",
     )
 
 
 def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) -> None:
-    """Refuse settings whose observations are not those of the settings ``trained`` in.
+    """Refuse settings whose observations differ from those of the settings ``trained`` in.
 
     Raises:
-        UsageError: the goal is observed in the ones and not in the others.
+        UsageError: the goal is observed in some of them and not in others.
     """
     known = environment(env).knobs
 
@@ -106,8 +105,8 @@ def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) 
             goals = ", ".join(name for name, knob in known.items() if knob.observed)
             others = ", ".join(name for name, knob in known.items() if not knob.observed)
             raise UsageError(
-                f"{env} {setting} has other observations than {', '.join(trained)}: a goal is part "
-                "of them",
+                f"{env} {setting} and {', '.join(trained)} have different observations: one includes "
+                "a goal, the other does not",
                 f"name a setting of {goals if learned else others}",
             )
 
@@ -126,7 +125,7 @@ def knob_of(env: str, knob: str) -> Knob:
         hint = f"{knob!r} belongs to {', '.join(others)}; {env} has: {', '.join(sorted(knobs))}"
     else:
         hint = suggest(knob, knobs)
-    raise UsageError(f"environment {env!r} has no intervention {knob!r}", hint)
+    raise UsageError(f"{env} has no intervention {knob!r}", hint)
 
 
 def parse_value(env: str, knob: str, text: str) -> Value:
@@ -155,18 +154,18 @@ def parse_value(env: str, knob: str, text: str) -> Value:
             )
         if spec.whole and not all(x.is_integer() for x in numbers):
             raise UsageError(
-                f"{knob}={text.strip()!r} is no whole number",
+                f"{knob}={text.strip()!r} is not a whole number",
                 f"{knob} ({spec.description}) is one of {_format(spec.low)} to {_format(spec.high)}",
             )
         for x in numbers:
             if not math.isfinite(x) or not spec.low <= x <= spec.high:
                 raise UsageError(
                     f"{knob}={text.strip()!r} is out of range",
-                    f"{knob} ({spec.description}) lies in {_format(spec.low)} to {_format(spec.high)}",
+                    f"{knob} ({spec.description}) must lie in {_format(spec.low)} to {_format(spec.high)}",
                 )
         return Value(form, numbers)
     raise UsageError(
-        f"{knob}={text.strip()!r} is no intervention value", f"write it like {knob}={examples}"
+        f"{knob}={text.strip()!r} is not an intervention value", f"write it like {knob}={examples}"
     )
 
 
@@ -181,7 +180,7 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
     if not equals or not knob or not values.strip():
         names = sorted(environment(env).knobs)
         raise UsageError(
-            f"{text!r} is no intervention",
+            f"{text!r} is not an intervention",
             f"write KNOB=VALUE,VALUE; {env} has: {', '.join(names)}",
         )
     knob_of(env, knob)
@@ -192,13 +191,13 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
                 again = f", once as {setting}" if setting != other else ""
                 raise UsageError(
                     f"{text!r} names {other} twice{again}",
-                    "each setting is one dataset group: name it once",
+                    "name each setting once",
                 )
     return settings
 
 
 def world(setting: Setting) -> tuple[float, ...]:
-    """Equal for values of a knob that make one world, however written: 10 and 10..10."""
+    """The numbers of a value, equal for values that make the same world: 10 and 10..10."""
     form, numbers = setting.value or ("absolute", ())
     return numbers[:1] if form == "range" and numbers[0] == numbers[1] else numbers
 
@@ -212,7 +211,7 @@ def covers(wide: Setting, narrow: Setting) -> bool:
 
 
 def overlap(one: Setting, other: Setting) -> bool:
-    """Whether they share worlds: one covers the other, or two ranges meet in more than an end."""
+    """Whether two settings share worlds: one covers the other, or their ranges overlap."""
     if covers(one, other) or covers(other, one):
         return True
     if not all(s.value is not None and s.value.form == "range" for s in (one, other)):
@@ -231,7 +230,7 @@ def parse_setting(env: str, text: str) -> Setting:
         return Setting()
     settings = parse_settings(env, text)
     if len(settings) != 1:
-        raise UsageError(f"{text!r} names {len(settings)} settings where one is needed", "name one")
+        raise UsageError(f"{text!r} names {len(settings)} settings, but one is needed", "name one")
     return settings[0]
 
 

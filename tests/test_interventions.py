@@ -245,7 +245,7 @@ def test_knob_of_another_environment_names_its_owner():
 def test_one_setting():
     assert parse_setting(LANDER, "default") == Setting()
     assert parse_setting(LANDER, "bounce=0.5") == Setting("bounce", Value("absolute", (0.5,)))
-    with pytest.raises(UsageError, match="2 settings where one") as caught:
+    with pytest.raises(UsageError, match="2 settings, but one") as caught:
         parse_setting(LANDER, "bounce=0.1,0.5")
     assert caught.value.hint
 
@@ -355,7 +355,7 @@ def test_a_goal_that_the_policy_cannot_see_is_refused(trained, wanted, fits):
     if fits:
         check_observed("ant", [trained], places)
         return
-    with pytest.raises(UsageError, match="other observations") as caught:
+    with pytest.raises(UsageError, match="different observations") as caught:
         check_observed("ant", [trained], places)
     goals = trained == "goal-y=0"
     assert ("goal-y, direction" in caught.value.hint) == goals

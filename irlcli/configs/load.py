@@ -1,8 +1,8 @@
 """Configs from TOML files, profiles and ``--set``.
 
-One file per environment in ``settings/``. Precedence, weakest first: the defaults below, the
-environment's file, its profile, ``--settings FILE``, ``--set``, flags. Environment variables
-never enter: equal settings give equal artefacts wherever they run.
+One file per environment in ``settings/``. Precedence, weakest first: the schema's defaults, the
+environment's file, its profile, ``--settings FILE``, ``--set``, flags. Environment variables are
+not read, so equal configs give equal artefacts wherever they run.
 """
 
 import stat
@@ -28,7 +28,7 @@ _INTERVENTIONS = dict[str, InterventionConfig]
 
 
 def check_profile(profile: str) -> None:
-    """Refuse what is no profile.
+    """Refuse an unknown profile.
 
     Raises:
         UsageError: not one of :data:`PROFILES`.
@@ -158,7 +158,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
     for knob in tree.get("interventions", {}):
         knob_of(env, knob)
     try:
-        settings = msgspec.convert(tree, Config)
+        config = msgspec.convert(tree, Config)
     except msgspec.ValidationError as error:
         message, _, where = str(error).partition(" - at ")
         field = where.strip("`").removeprefix("$.")
@@ -166,7 +166,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
             knob = next(k for k, v in tree["interventions"].items() if not _is_listed(v))
             field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
         raise UsageError(f"{field}: {message}", _field_hint(field)) from None
-    for knob, values in settings.interventions.items():
+    for knob, values in config.interventions.items():
         trained, unseen = (
             parse_settings(env, f"{knob}={','.join(part)}") if part else ()
             for part in (values.id, values.ood)
@@ -180,9 +180,9 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
         if both := [str(s) for s in unseen if any(overlap(s, other) for other in trained)]:
             raise UsageError(
                 f"interventions.{knob}: {', '.join(both)} is both trained in (id) and held out (ood)",
-                "hold out what nothing is trained in",
+                "hold out settings that nothing is trained in",
             )
-    return settings
+    return config
 
 
 def _is_listed(values: Any) -> bool:
@@ -194,7 +194,7 @@ def _is_listed(values: Any) -> bool:
 
 
 def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
-    """Refuse unknown names, and values that are no tables: msgspec says too little of either."""
+    """Refuse unknown names, and values where tables belong: msgspec's messages name neither."""
     if kind == _INTERVENTIONS:
         fields = dict.fromkeys(tree, InterventionConfig) if isinstance(tree, Mapping) else {}
         inside = "[interventions.KNOB] with id and ood"
@@ -202,11 +202,11 @@ def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
         fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
         inside = f"[{'.'.join(path)}] with some of: {', '.join(fields)}"
     if not isinstance(tree, Mapping):
-        raise UsageError(f"{'.'.join(path)}: a table is needed, not {tree!r}", f"write {inside}")
+        raise UsageError(f"{'.'.join(path)}: expected a table, found {tree!r}", f"write {inside}")
     for name, value in tree.items():
         if name not in fields:
             where = ".".join((*path, str(name)))
-            raise UsageError(f"no setting {where!r}", suggest(str(name), fields))
+            raise UsageError(f"unknown field {where!r}", suggest(str(name), fields))
         for inner in (fields[name], *get_args(fields[name])):
             if inner == _INTERVENTIONS or (isinstance(inner, type) and issubclass(inner, Struct)):
                 _check_names(value, inner, (*path, name))
@@ -229,20 +229,21 @@ def _override(item: str) -> dict[str, Any]:
         if name not in fields:
             homes = [f"{home}.{name}" for home in _homes(name)] if len(path) == 1 else []
             hint = f"did you mean {' or '.join(homes)}?" if homes else suggest(name, fields)
-            raise UsageError(f"--set {item!r}: no setting {dotted.strip()!r}", hint)
+            raise UsageError(f"--set {item!r}: unknown field {dotted.strip()!r}", hint)
         kind = fields[name]
         if kind == _INTERVENTIONS:
             raise UsageError(
-                f"--set {item!r}: interventions are not set this way", "use --intervention or --ood"
+                f"--set {item!r}: --set does not change interventions",
+                "use --intervention or --ood",
             )
     if isinstance(kind, type) and issubclass(kind, Struct):
         names = ", ".join(f"{dotted.strip()}.{f.name}" for f in msgspec.structs.fields(kind))
-        raise UsageError(f"--set {item!r} names a group of settings", f"one of: {names}")
+        raise UsageError(f"--set {item!r} names a group of fields", f"one of: {names}")
     return _nest(path, _typed(text.strip(), kind, dotted.strip()))
 
 
 def _homes(name: str) -> list[str]:
-    """The groups of settings that have a field ``name``."""
+    """The groups that have a field ``name``."""
     return [
         f.name
         for f in msgspec.structs.fields(Config)
@@ -268,7 +269,7 @@ def _typed(text: str, kind: Any, field: str) -> Any:
 
 
 def _field_hint(field: str) -> str:
-    """What a field takes: its choices if it has some, else a value that it could have."""
+    """What a field takes: its choices, or an example."""
     value, kind = Config(), Config
     for name in field.split("."):
         name = name.partition("[")[0]

@@ -67,7 +67,8 @@ def request(
         )
     if len(candidates) < 2:
         raise UsageError(
-            "--choose-penalty needs at least two candidates", "for example --choose-penalty 0.1,1,10"
+            "--choose-penalty needs at least two candidates",
+            "for example --choose-penalty 0.1,1,10",
         )
     if airl.penalty == "none":
         raise UsageError("this method has no penalty to weigh", "--method irm has one")

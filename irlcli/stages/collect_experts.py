@@ -113,9 +113,7 @@ def run(job: Job) -> None:
         "deterministic": p.deterministic,
     }
     write_demonstrations(job.output, p.environment.name, groups, metadata)
-    write_json(
-        job.output / "summary.json", {"env": p.environment.name, "settings": summary}
-    )
+    write_json(job.output / "summary.json", {"env": p.environment.name, "settings": summary})
 
 
 def run_tabular(job: Job) -> None:
@@ -134,9 +132,7 @@ def run_tabular(job: Job) -> None:
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {"experts": "value iteration", "gridworld": msgspec.to_builtins(p.gridworld)}
     write_demonstrations(job.output, p.environment.name, groups, metadata)
-    write_json(
-        job.output / "summary.json", {"env": p.environment.name, "settings": summary}
-    )
+    write_json(job.output / "summary.json", {"env": p.environment.name, "settings": summary})
 
 
 def _summary(text: str, trajectories: Sequence[Any]) -> dict[str, Any]:

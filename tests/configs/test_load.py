@@ -9,7 +9,6 @@ import msgspec
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from msgspec import UNSET
 
 from irlcli.configs import PROFILES, Config, load_config
 from irlcli.envs.registry import ENVIRONMENTS
@@ -18,7 +17,7 @@ from irlcli.interventions import parse_settings
 from irlcli.store import canonical_json
 
 LANDER = "lunar-lander"
-SETTINGS = Path(__file__).parent.parent / "settings"
+SETTINGS = Path(__file__).parents[2] / "settings"
 
 
 @pytest.fixture
@@ -46,13 +45,13 @@ def refused(*args, **kwargs) -> UsageError:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("path", sorted(SETTINGS.glob("*.toml")), ids=lambda p: p.stem)
-def test_every_shipped_profile_loads(path, profile):
-    settings = load_config(path.stem, profile)
+@pytest.mark.parametrize("env", sorted(ENVIRONMENTS))
+def test_every_shipped_profile_loads(env, profile):
+    settings = load_config(env, profile)
     canonical_json(msgspec.to_builtins(settings))  # can be part of a key
     for knob, values in settings.interventions.items():
         trained, held_out = (
-            {s for v in side for s in parse_settings(path.stem, f"{knob}={v}")}
+            {s for v in side for s in parse_settings(env, f"{knob}={v}")}
             for side in (values.id, values.ood)
         )
         assert (trained or held_out) and not trained & held_out
@@ -61,8 +60,8 @@ def test_every_shipped_profile_loads(path, profile):
     assert any(k.id for k in knobs) and any(k.ood for k in knobs)
 
 
-def test_every_environment_has_settings_and_the_reverse():
-    assert {p.stem for p in SETTINGS.glob("*.toml")} == set(ENVIRONMENTS)
+def test_every_file_is_an_environments_or_the_experiments():
+    assert {p.stem for p in SETTINGS.glob("*.toml")} - {"experiments"} == set(ENVIRONMENTS)
 
 
 @pytest.mark.parametrize("path", sorted(SETTINGS.glob("*/*.toml")), ids=lambda p: p.parent.name)
@@ -85,15 +84,17 @@ def test_defaults_file_profile_settings_flags_and_set(toml):
     assert Config().expert.total_steps == 1_000_000
     assert load_config(LANDER).expert.total_steps == 2_000_000
     assert load_config(LANDER, "smoke").expert.total_steps == 4096
-    mine = toml("[expert]\ntotal_steps = 5000\n[airl]\npenalty_weight = 5\nmethod = 'irm'")
+    mine = toml(
+        "[expert]\ntotal_steps = 5000\n[airl]\npenalty_weight = 5\ngrouping = 'per-setting'"
+    )
     loaded = load_config(LANDER, "smoke", mine)
     assert (loaded.expert.total_steps, loaded.airl.penalty_weight) == (5000, 5.0)
     loaded = load_config(LANDER, "smoke", mine, ["expert.total_steps=6000"])
     assert loaded.expert.total_steps == 6000
     loaded = load_config(
-        LANDER, "smoke", mine, [], {"airl.penalty_weight": 7.0, "airl.method": None}
+        LANDER, "smoke", mine, [], {"airl.penalty_weight": 7.0, "airl.grouping": None}
     )
-    assert (loaded.airl.penalty_weight, loaded.airl.method) == (7.0, "irm")
+    assert (loaded.airl.penalty_weight, loaded.airl.grouping) == (7.0, "per-setting")
 
 
 def test_the_later_set_wins():
@@ -114,14 +115,14 @@ def test_a_knob_has_experts_of_its_own(toml):
     """Within a layer what is said of the knob wins over ``expert.ppo``; a later layer wins over both."""
     mine = toml(
         "[expert.ppo]\nn_epochs = 3\ngamma = 0.5\n"
-        "[interventions.bounce.expert_ppo]\nn_epochs = 7\nuse_sde = true"
+        "[interventions.bounce.expert.ppo]\nn_epochs = 7\nuse_sde = true"
     )
     config = load_config(LANDER, "smoke", mine, ["expert.ppo.gamma=0.25"])
     bounce, power = (
         config.expert_of(parse_settings(LANDER, text)[0])
         for text in ("bounce=0.1", "engine-power=1x")
     )
-    assert power == config.expert and power.ppo.use_sde is UNSET
+    assert power == config.expert and not power.ppo.use_sde
     assert (power.ppo.n_epochs, power.ppo.gamma) == (3, 0.25)
     changed = msgspec.structs.replace(config.expert.ppo, n_epochs=7, use_sde=True)
     assert bounce == msgspec.structs.replace(config.expert, ppo=changed)
@@ -135,7 +136,7 @@ def test_an_empty_file_changes_nothing(toml):
 
 def test_environment_variables_never_enter(monkeypatch):
     before = load_config(LANDER)
-    for name in ("AIRL_METHOD", "IRL_AIRL_METHOD", "IRL_PROFILE", "IRL_SETTINGS", "airl.method"):
+    for name in ("AIRL_METHOD", "IRL_AIRL_METHOD", "IRL_PROFILE", "IRL_SETTINGS", "airl.grouping"):
         monkeypatch.setenv(name, "irm")
     assert load_config(LANDER) == before
 
@@ -158,9 +159,11 @@ def test_however_written_it_is_one_value_and_so_one_key(toml, text):
     [
         ("airl.penalty_weight=30", 30.0),
         ("airl.penalty_weight = 1e-3", 0.001),
-        ("airl.method=irm", "irm"),
-        ("airl.method='irm'", "irm"),
-        ('airl.method="erm-balanced"', "erm-balanced"),
+        ("airl.grouping=per-setting", "per-setting"),
+        ("airl.grouping='pooled'", "pooled"),
+        ('airl.select="leg-length=1x"', "leg-length=1x"),
+        ("airl.ppo.log_std_max=none", None),
+        ("airl.ppo.log_std_max=-1", -1.0),
         ("airl.state_only=true", True),
         ("airl.hidden=[8, 16]", (8, 16)),
         ("airl.ppo.n_envs=4", 4),
@@ -180,19 +183,19 @@ def test_set_is_typed_by_its_field(item, value):
     [
         ("airl.penalty_weight", "has no '='", "--set airl.penalty_weight=30"),
         ("", "has no '='", "--set"),
-        ("bc_epochs=2", "no setting 'bc_epochs'", "did you mean airl.bc_epochs?"),
+        ("bc_epochs=2", "'bc_epochs'", "did you mean airl.bc_epochs?"),
         ("airl.actions=samples", "Invalid enum value", "one of: sampled, executed"),
         ("=3", "''", "known: "),
-        ("airl=3", "group", "airl.method"),
+        ("airl=3", "group", "airl.grouping"),
         ("airl.ppo=3", "group", "airl.ppo.n_envs"),
         ("airl.penalty_wieght=3", "airl.penalty_wieght", "did you mean 'penalty_weight'"),
         ("arl.penalty_weight=3", "arl.penalty_weight", "did you mean 'airl'"),
         ("airl.ppo.n_env=3", "airl.ppo.n_env", "did you mean 'n_envs'"),
         ("airl.penalty_weight.x=3", "airl.penalty_weight", ""),
-        ("airl..method=irm", "airl..method", "known: "),
+        ("airl..grouping=pooled", "airl..grouping", "known: "),
         ("interventions.bounce=3", "interventions", "--intervention"),
         ("profiles.smoke=3", "profiles.smoke", "known: "),
-        ("airl.method=IRM", "airl.method=IRM", "erm"),
+        ("airl.grouping=POOLED", "airl.grouping=POOLED", "pooled"),
         ("airl.penalty_weight=abc", "airl.penalty_weight=abc", "10.0"),
         ("airl.penalty_weight=true", "airl.penalty_weight=true", "10.0"),
         ("airl.penalty_weight=", "airl.penalty_weight=", "10.0"),
@@ -272,20 +275,20 @@ def test_files_that_cannot_be_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "named", "hint"),
     [
-        ("[arl]\nmethod = 'irm'", "'arl'", "did you mean 'airl'"),
-        ("[airl]\nmethd = 'irm'", "'airl.methd'", "did you mean 'method'"),
+        ("[arl]\ngrouping = 'per-setting'", "'arl'", "did you mean 'airl'"),
+        ("[airl]\ngroupng = 'pooled'", "'airl.groupng'", "did you mean 'grouping'"),
         ("[airl.ppo]\nn_env = 3", "'airl.ppo.n_env'", "did you mean 'n_envs'"),
-        ("[profiles.smoke.airl]\nmethod = 'irm'", "'profiles'", "known: "),
-        ("airl = 3", "airl: a table is needed, not 3", "[airl] with some of: method"),
-        ("airl = []", "airl: a table is needed, not []", "[airl]"),
-        ("[airl]\nppo = 1", "airl.ppo: a table is needed", "[airl.ppo] with some of: n_envs"),
-        ("[airl]\nmethod = 'gail'", "airl.method", "erm"),
+        ("[profiles.smoke.airl]\ngrouping = 'per-setting'", "'profiles'", "known: "),
+        ("airl = 3", "airl: expected a table, found 3", "[airl] with some of: learner"),
+        ("airl = []", "airl: expected a table, found []", "[airl]"),
+        ("[airl]\nppo = 1", "airl.ppo: expected a table", "[airl.ppo] with some of: n_envs"),
+        ("[airl]\ngrouping = 'all'", "airl.grouping", "pooled"),
         ("[airl]\npenalty_weight = '3'", "airl.penalty_weight", "10.0"),
         ("[airl]\npenalty_weight = 2024-01-01", "airl.penalty_weight", "10.0"),
         ("[airl]\nhidden = [8, 'x']", "airl.hidden", "[32,32]"),
         ("[expert]\ntotal_steps = -1", "expert.total_steps", "1000000"),
         ("[expert]\ntotal_steps = 99999999999999999999999", "expert.total_steps", "1000000"),
-        ("interventions = 3", "interventions: a table is needed", "[interventions.KNOB]"),
+        ("interventions = 3", "interventions: expected a table", "[interventions.KNOB]"),
         ("[interventions.bounce]\nid = ['0.1']\nood = ['1.5']", "bounce", "0 to 1"),
         ("[interventions.bounce]\nid = ['soft']\nood = ['0.9']", "bounce", "bounce=0.5"),
         ("[interventions.bounce]\nid = [0.1]\nood = ['0.9']", "interventions", ""),
@@ -309,17 +312,17 @@ def test_files_that_cannot_be_read(tmp_path):
             "hold out",
         ),
         (
-            "[interventions.bounce.expert_ppo]\nn_epoch = 3",
-            "expert_ppo.n_epoch'",
+            "[interventions.bounce.expert.ppo]\nn_epoch = 3",
+            "expert.ppo.n_epoch'",
             "did you mean 'n_epochs'",
         ),
-        ("[interventions.bounce.expert_ppo]\nn_epochs = 0", "expert_ppo.n_epochs", ""),
+        ("[interventions.bounce.expert.ppo]\nn_epochs = 0", "expert.ppo.n_epochs", ""),
         (
-            "[interventions.bounce]\nexpert_ppo = 3",
-            "bounce.expert_ppo: a table is needed",
-            "[interventions.bounce.expert_ppo]",
+            "[interventions.bounce.expert]\nppo = 3",
+            "bounce.expert.ppo: expected a table",
+            "[interventions.bounce.expert.ppo]",
         ),
-        ("[interventions]\nbounce = 3", "interventions.bounce: a table is needed", "id, ood"),
+        ("[interventions]\nbounce = 3", "interventions.bounce: expected a table", "id, ood"),
         ("[interventions.leg-length]\nid = ['1x']\nood = ['2x']", "leg-length", "bounce"),
     ],
 )
@@ -335,8 +338,8 @@ def test_the_layer_at_fault_is_named_not_an_innocent_one(toml):
     """A file may complete what it overrides only in part."""
     path = toml("[interventions.engine-power]\nood = ['2x']")
     assert load_config(LANDER, file=path).interventions["engine-power"].ood == ("2x",)
-    error = refused(file=path, flags={"airl.method": "gail"})
-    assert "--method" in error.message and "gail" in error.message
+    error = refused(file=path, flags={"airl.grouping": "all"})
+    assert "--grouping" in error.message and "all" in error.message
     assert str(path) not in error.message
 
 
