@@ -189,7 +189,12 @@ def test_only_rl_knows_stable_baselines():
 def test_light_modules_import_nothing_heavy_at_their_top(name):
     """Planning and hits load these."""
     found = imported(modules()[name], top_level_only=True)
-    heavy = HEAVY | {"numpy", "irlcli.networks", "irlcli.data.tensors", "irlcli.data.demonstrations"}
+    heavy = HEAVY | {
+        "numpy",
+        "irlcli.networks",
+        "irlcli.data.tensors",
+        "irlcli.data.demonstrations",
+    }
     assert not {n for n in found if within(n, heavy)}
 
 

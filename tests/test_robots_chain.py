@@ -1,0 +1,133 @@
+"""The robots through the real command line: workers, progress, goals, pictures, bad input."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from irlcli.store import Store
+
+
+@pytest.fixture(scope="module")
+def chains(tmp_path_factory, run_irl):
+    """The Reacher's chain with one worker and with two, by the command line: two stores."""
+    base = tmp_path_factory.mktemp("robots")
+    for workers in ("1", "2"):
+        common = ["--store", str(base / workers), "--profile", "smoke", "--quiet"]
+        common += ["--workers", workers, "--name"]
+        for arguments in (
+            ["collect-experts", "--env", "reacher", "--intervention", "gravity", *common, "demos"],
+            ["train-airl", "--demos", "demos", "--method", "irm", *common, "airl"],
+            ["transfer", "--reward", "airl", "--ood", "gravity", *common, "moved"],
+            ["evaluate", "--policy", "moved", *common, "score"],
+        ):
+            done = run_irl(arguments)
+            assert done.code == 0, done.err
+    return base
+
+
+def test_the_number_of_workers_changes_no_byte(chains):
+    one, two = Store(chains / "1"), Store(chains / "2")
+    assert one.names() == two.names()
+    assert one.ids() == two.ids() and len(one.ids()) == 6
+    assert not two.verify(two.ids())
+    assert {a.provenance()["workers"] for a in two.artefacts()} == {2}
+
+
+def test_progress_stands_beside_the_return(chains, irl):
+    done = irl("report", "returns", "score", "--store", chains / "1")
+    assert done.code == 0 and "progress" in done.out.splitlines()[0]
+    assert "reacher gravity=4x" in done.out
+
+
+@pytest.mark.parametrize(
+    ("env", "intervention", "ood"),
+    [("ant", "leg-length=1x,2x", "3x"), ("half-cheetah", "goal-y", "goal-y")],
+)
+def test_walkers_go_through_the_chain(tmp_path, irl, env, intervention, ood):
+    common = ["--store", tmp_path, "--profile", "smoke", "--quiet", "--name"]
+    for section in ("expert", "airl", "transfer"):
+        common[:0] = ["--set", f"{section}.ppo.n_steps=64", "--set", f"{section}.total_steps=256"]
+    for arguments in (
+        ["collect-experts", "--env", env, "--intervention", intervention, *common, "demos"],
+        ["train-airl", "--demos", "demos", "--method", "erm", *common, "airl"],
+        ["transfer", "--reward", "airl", "--ood", ood, *common, "moved"],
+    ):
+        done = irl(*arguments)
+        assert done.code == 0, done.err
+    done = irl("transfer", "--reward", "airl", "--ood", "mass=2x", *common, "other")
+    if env == "ant":
+        assert done.code == 0, done.err
+    else:
+        refused = [done]
+        refused.append(irl("evaluate", "--policy", "moved", "--ood", "mass=2x", *common[:-1]))
+        refused.append(
+            irl("play", "moved", "--ood", "mass=2x", "--store", tmp_path, "--out", "x.gif")
+        )
+        for done in refused:
+            assert done.code == 2
+            assert "half-cheetah mass=2x" in done.err and "different observations" in done.err
+            assert "hint: name a setting of goal-y, direction" in done.err
+            assert "RUN" not in done.err
+
+
+def test_play_draws_the_settings_side_by_side(chains, irl, tmp_path):
+    file = tmp_path / "moved.gif"
+    arguments = ["play", "moved", "--store", chains / "1", "--ood", "2x,0.5x", "--steps", "12"]
+    done = irl(*arguments, "--out", file)
+    assert done.code == 0, done.err
+    assert done.out == f"{file}\n"
+    with Image.open(file) as gif:
+        assert gif.n_frames == 5 and gif.width == 3 * 320
+        gif.seek(4)
+        picture = np.array(gif.convert("RGB")).astype(int)
+    left, middle = picture[16:, :320], picture[16:, 320:640]
+    assert left.std() > 1.0
+    assert (left != middle).any()
+    assert (picture[:16, :320] != picture[:16, 320:640]).any()
+
+
+def test_play_refuses_a_damaged_policy(chains, irl, tmp_path):
+    store = tmp_path / "runs"
+    shutil.copytree(chains / "1", store, symlinks=True)
+    path = Store(store).resolve("moved").artefact.directory / "policy.pt"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-1] + b"!")
+    done = irl("play", "moved", "--store", store, "--out", tmp_path / "x.gif")
+    assert done.code == 4 and "hint:" in done.err
+    assert not (tmp_path / "x.gif").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["play", "moved", "--out", "x.mp4"], "does not end in .gif"),
+        (["play", "moved", "--out", "no/x.gif"], "no/x.gif cannot be written"),
+        (["play", "moved", "--ood", "mass=2x", "--out", "x.gif"], "no intervention 'mass'"),
+        (["play", "score", "--out", "x.gif"], "holds no policy.pt"),
+        (
+            ["train-airl", "--demos", "demos", "--set", "airl.ppo.use_sde=true"],
+            "gSDE's noise lasts several steps",
+        ),
+        (
+            [
+                *("collect-experts", "--env", "lunar-lander", "--intervention", "bounce=0.1"),
+                *("--profile", "smoke", "--set", "expert.ppo.use_sde=true"),
+            ],
+            "ppo.use_sde needs continuous actions",
+        ),
+        (["evaluate", "--idle", "--env", "reacher", "--ood", "gravity=21x"], "0 to 20"),
+        (["evaluate", "--idle", "--env", "ant", "--ood", "friction=1"], "as triple"),
+        (
+            ["evaluate", "--idle", "--env", "ant", "--ood", "gravity=2x"],
+            "'gravity' belongs to reacher",
+        ),
+        (["evaluate", "--idle", "--env", "reacher", "--ood", "gravity", "--workers", "0"], "0"),
+    ],
+)
+def test_bad_input_is_one_line_and_a_hint(chains, irl, tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    done = irl(*arguments, "--store", chains / "1")
+    assert done.code in (2, 3) and done.out == ""
+    assert said in done.err and "hint:" in done.err and "Traceback" not in done.err
