@@ -51,6 +51,19 @@ def method(name: str) -> Method:
     return METHODS[name]
 
 
+def fields(name: str, section: str) -> dict[str, str]:
+    """The config fields that ``--method NAME`` sets in ``section``: ``airl`` or ``maxent``.
+
+    Raises:
+        UsageError: there is no such method.
+    """
+    chosen = method(name)
+    values = {"grouping": chosen.grouping, "penalty": chosen.penalty}
+    if section == "airl":
+        values["learner"] = chosen.learner
+    return {f"{section}.{field}": value for field, value in values.items()}
+
+
 def method_name(learner: str, grouping: str, penalty: str) -> str:
     """The name of a combination; the combination itself where it has no name."""
     for known in METHODS.values():

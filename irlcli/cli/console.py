@@ -171,8 +171,13 @@ def _write(text: str, stream: TextIO) -> None:
         hang_up()
 
 
+def print_note(text: str) -> None:
+    """Lines for the reader on stderr, beside the data."""
+    _write(text.translate(_CONTROLS_BUT_NEWLINE), sys.stderr)
+
+
 def print_data(text: str) -> None:
-    """Lines of data on stdout; quietly the end of the program if nobody reads them any more."""
+    """Lines of data on stdout. Ends the program quietly if the reader has closed the pipe."""
     _write(text.translate(_CONTROLS_BUT_NEWLINE), sys.stdout)
 
 

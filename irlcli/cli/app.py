@@ -1,0 +1,86 @@
+"""The table of commands. Only the module of the command that is called is imported.
+
+To add a command, write a function in a module of this package, decorated with
+:func:`irlcli.cli.options.stage_command` or :func:`~irlcli.cli.options.store_command`, and add a
+line here.
+"""
+
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from irlcli.cli.console import print_data
+
+# Command -> (module of this package, one-line help). The function has the command's name, with
+# underscores; its docstring is the help of the command itself.
+COMMANDS = {
+    "collect-experts": ("collect", "Train an expert per setting and record its demonstrations."),
+    "train-airl": ("train", "Learn a reward and a student policy from demonstrations."),
+    "train-maxent": ("train", "Learn a reward from demonstrations in a gridworld, exactly."),
+    "transfer": ("transfer", "Train a new policy on a frozen reward in an unseen setting."),
+    "evaluate": ("evaluate", "Measure the return of a policy, an expert or a baseline."),
+    "play": ("play", "Draw a policy as a GIF, several settings side by side."),
+    "report": ("report", "Print or write a table or figure from stored results."),
+    "ls": ("artefacts", "List the artefacts."),
+    "show": ("artefacts", "Show an artefact: its stage, parameters, inputs and outputs."),
+    "lineage": ("artefacts", "Show every artefact that an artefact was made from."),
+    "name": ("artefacts", "Name an artefact, which also protects it from gc."),
+    "verify": ("integrity", "Check stored bytes against their digests."),
+    "gc": ("integrity", "List or delete artefacts that no name depends on."),
+}
+
+
+class Commands(TyperGroup):
+    """A group that lists :data:`COMMANDS` by their one-line help and loads one when it is called.
+
+    Importing and inspecting all commands would take longer than a cache hit.
+    """
+
+    def __init__(self, **attributes: Any):
+        super().__init__(**attributes)
+        self.commands = {
+            name: TyperCommand(name, short_help=help_) for name, (_, help_) in COMMANDS.items()
+        }
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
+        name, listed, rest = super().resolve_command(ctx, args)
+        return name, listed and _load(listed.name), rest
+
+
+def _load(name: str) -> Any:
+    module, _ = COMMANDS[name]
+    function = getattr(import_module(f"irlcli.cli.{module}"), name.replace("-", "_"))
+    single = typer.Typer(add_completion=False, rich_markup_mode=None)
+    single.command(name)(function)
+    return typer.main.get_command(single)
+
+
+app = typer.Typer(
+    name="irl",
+    cls=Commands,
+    help="Invariant reward learning: experts, adversarial IRL, transfer, evaluation.",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print_data(f"irlcli {version('irlcli')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    pass

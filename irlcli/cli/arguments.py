@@ -1,0 +1,161 @@
+"""Text of options as settings, counts and numbers."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+
+from irlcli.configs.schema import NonNegative
+from irlcli.envs.registry import environment
+from irlcli.errors import UsageError
+from irlcli.interventions import Setting, check_observed, knob_of, parse_setting, parse_settings
+
+if TYPE_CHECKING:
+    from irlcli.configs import Config
+    from irlcli.data.descriptions import Policy, Reward
+
+
+def named_settings(
+    env: str,
+    config: "Config",
+    text: str,
+    kind: Literal["id", "ood"],
+    origin: "Reward | Policy | None" = None,
+) -> Sequence[Setting]:
+    """The settings that ``text`` names.
+
+    ``knob=3x,4x``. A knob alone stands for its values in the settings file, those of ``kind``.
+    ``3x,4x`` alone are values of the knob that ``origin`` was trained with.
+
+    Raises:
+        UsageError: malformed, empty, or a setting whose observations differ from ``origin``'s.
+    """
+    settings = _parse(env, config, text, kind, origin)
+    if origin is not None:
+        check_observed(env, origin.settings, settings)
+    return settings
+
+
+def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
+    if "=" in text:
+        return parse_settings(env, text)
+    if text in config.interventions:
+        values = getattr(config.interventions[text], kind)
+        if not values:
+            raise UsageError(
+                f"the settings file lists no {kind.upper()} values of {text!r}",
+                f"write {text}=VALUE,VALUE",
+            )
+        return parse_settings(env, f"{text}={','.join(values)}")
+    if origin is None or text in environment(env).knobs or text[:1].isalpha():
+        knob_of(env, text)
+        raise UsageError(f"{text!r} names no value", f"write {text}=VALUE,VALUE")
+    knob, equals, _ = origin.settings[0].partition("=")
+    if not equals:
+        raise UsageError(f"{text!r} names no intervention", "write KNOB=VALUE")
+    return parse_settings(env, f"{knob}={text}")
+
+
+def unseen_settings(env: str, config: "Config") -> list[Setting]:
+    """Every OOD setting that the settings file lists."""
+    return [
+        parse_setting(env, f"{knob}={value}")
+        for knob, values in config.interventions.items()
+        for value in values.ood
+    ]
+
+
+def check_env(ref: str, learned: str, wanted: str | None) -> None:
+    """Refuse ``--env`` if it is not the environment in which the file ``ref`` was learned.
+
+    Raises:
+        UsageError: unknown, or another environment.
+    """
+    if wanted is not None and wanted != learned:
+        environment(wanted)
+        raise UsageError(
+            f"{ref!r} was learned in {learned}, not in {wanted}",
+            "rewards and policies do not fit another environment's observations",
+        )
+
+
+def counts(text: str) -> tuple[int, ...]:
+    """``--episodes``: ``10``, or ``1,3,10`` for three settings.
+
+    Raises:
+        UsageError: not a list of whole numbers.
+    """
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"--episodes {text!r} is not a list of counts", "write 10, or 1,3,10 for three settings"
+        ) from None
+
+
+def seeds(text: str) -> tuple[int, ...]:
+    """``--seeds``: ``0,1,2,3,4``.
+
+    Raises:
+        UsageError: not a list of whole numbers from 0 up.
+    """
+    try:
+        numbers = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--seeds {text!r} is not a list of seeds", "write 0,1,2,3,4") from None
+    if min(numbers) < 0:
+        raise UsageError(f"--seeds {text!r} holds a negative seed", "seeds are 0 or more")
+    return numbers
+
+
+def weights(text: str) -> list[float]:
+    """``--choose-penalty``: ``0.1,1,10``.
+
+    Raises:
+        UsageError: not a list of finite numbers from 0 up.
+    """
+    try:
+        return msgspec.convert(text.split(","), list[NonNegative], strict=False)
+    except msgspec.ValidationError:
+        raise UsageError(
+            f"--choose-penalty {text!r} is not a list of numbers from 0 up", "write 0.1,1,10"
+        ) from None
+
+
+def method_fields(
+    learner: Literal["airl", "maxent"],
+    method: str | None,
+    grouping: str | None,
+    penalty: str | None,
+) -> dict[str, Any]:
+    """Config fields of ``--method``, and of ``--grouping`` and ``--penalty``, which override it.
+
+    Raises:
+        UsageError: an unknown method, or a penalty that the learner does not have.
+    """
+    from irlcli.methods import fields
+    from irlcli.penalties import check_penalty
+
+    found = fields(method, learner) if method is not None else {}
+    if grouping is not None:
+        found[f"{learner}.grouping"] = grouping
+    if penalty is not None:
+        check_penalty(penalty, learner)
+        found[f"{learner}.penalty"] = penalty
+    return found
+
+
+def check_weighted(name: str, penalty: str, penalty_weight: float | None) -> None:
+    """Refuse ``--penalty-weight`` for a method without a penalty.
+
+    Raises:
+        UsageError: the weight would have no effect.
+    """
+    if penalty_weight is not None and penalty == "none":
+        from irlcli.methods import METHODS
+
+        penalised = [m.name for m in METHODS.values() if m.penalty != "none"]
+        raise UsageError(
+            f"--penalty-weight {penalty_weight:g}: {name} has no penalty",
+            f"give --method {' or '.join(penalised)}, or omit --penalty-weight",
+        )

@@ -1,0 +1,125 @@
+"""``irl ls``, ``show``, ``lineage`` and ``name``: what is stored."""
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from irlcli.cli import about
+from irlcli.cli import console as out
+from irlcli.cli.options import Ref, store_command
+from irlcli.cli.session import Session
+from irlcli.store import Artefact, Index
+
+
+@store_command
+def ls(
+    session: Session,
+    stage: Annotated[str | None, typer.Option(help="Only artefacts of this stage.")] = None,
+) -> None:
+    """List the artefacts."""
+    session.check_exists()
+    names: dict[str, list[str]] = {}
+    for name, id16 in session.store.names().items():
+        names.setdefault(id16, []).append(name)
+    index = session.store.index()
+    stored = list(index.artefacts.values())
+    makers = {o.sha256: a.manifest.record for a in stored for o in a.manifest.outputs}
+    found = [
+        {
+            "id": artefact.id,
+            "stage": record.stage,
+            "names": names.get(artefact.id, []),
+            "about": about.describe(record.parameters) + about.origin(record, makers),
+            "bytes": sum(output.size for output in artefact.manifest.outputs),
+        }
+        for artefact in stored
+        if stage in (None, (record := artefact.manifest.record).stage)
+    ]
+    found.sort(key=lambda item: (item["stage"], item["about"], item["id"]))
+    if stage is not None and not found:
+        known = sorted({artefact.manifest.record.stage for artefact in stored})
+        session.console.warn(f"no artefact is of stage {stage!r}; stored are: {', '.join(known)}")
+    if session.as_json:
+        out.print_json("artefacts", {"artefacts": found, "newer": sorted(index.newer)})
+        return
+    rows = [[item["id"], item["stage"], item["about"], ", ".join(item["names"])] for item in found]
+    if rows:
+        out.print_table(["id", "stage", "about", "names"], rows)
+
+
+@store_command
+def show(session: Session, ref: Ref) -> None:
+    """Show an artefact: its stage, parameters, inputs and outputs."""
+    artefact = session.artefact(ref)
+    record = artefact.manifest.record
+    value = {
+        "id": artefact.id,
+        "path": str(artefact.directory),
+        "key": record.key,
+        **record.as_json(),
+        "outputs": {
+            output.path: {"size": output.size, "sha256": output.sha256}
+            for output in artefact.manifest.outputs
+        },
+        "provenance": artefact.provenance(),
+    }
+    if session.as_json:
+        out.print_json("artefact", value)
+    else:
+        out.print_data(json.dumps(value, indent=2))
+
+
+@store_command
+def lineage(session: Session, ref: Ref) -> None:
+    """Show every artefact that an artefact was made from."""
+    artefact = session.artefact(ref)
+    tree = _tree(session.store.index(), artefact, ())
+    if session.as_json:
+        out.print_json("lineage", tree)
+        return
+    for line in _lines(tree, ""):
+        out.print_data(line)
+
+
+def _tree(index: Index, artefact: Artefact, descendants: tuple[str, ...]) -> dict[str, Any]:
+    record = artefact.manifest.record
+    descendants = (*descendants, artefact.id)
+    inputs = []
+    for role, sources in index.parents(artefact).items():
+        # Inputs are known by content. A descendant may hold an equal file: it is not an ancestor.
+        source = next((s for s in sources if s.id not in descendants), None)
+        origin = _tree(index, source, descendants) if source is not None else None
+        inputs.append({"role": role, "sha256": record.inputs[role], "from": origin})
+    return {
+        "id": artefact.id,
+        "stage": record.stage,
+        "about": about.describe(record.parameters),
+        "inputs": inputs,
+    }
+
+
+def _lines(node: dict[str, Any], indent: str) -> list[str]:
+    lines = [f"{indent}{node['id']}  {node['stage']}  {node['about']}"]
+    for item in node["inputs"]:
+        if item["from"] is None:
+            sha = item["sha256"][:16]
+            lines.append(f"{indent}  a file that is not in this store, sha256 {sha}...")
+        else:
+            lines += _lines(item["from"], indent + "  ")
+    return lines
+
+
+@store_command
+def name(
+    session: Session,
+    ref: Ref,
+    name: Annotated[str, typer.Argument(help="The name.")],
+) -> None:
+    """Name an artefact, which also protects it from gc."""
+    artefact = session.artefact(ref)
+    session.name(name, artefact)
+    if session.as_json:
+        out.print_json("name", {"name": name, "id": artefact.id})
+    else:
+        out.print_data(str(artefact.directory))

@@ -1,0 +1,47 @@
+"""Values that the shell completes. Each function imports what it lists when it is asked."""
+
+
+def environments(incomplete: str) -> list[str]:
+    """Names of environments."""
+    from irlcli.envs.registry import ENVIRONMENTS
+
+    return list(ENVIRONMENTS)
+
+
+def methods(incomplete: str) -> list[tuple[str, str]]:
+    """Names of methods, with their titles."""
+    from irlcli.methods import METHODS
+
+    return [(method.name, method.title) for method in METHODS.values()]
+
+
+def groupings(incomplete: str) -> list[str]:
+    """Ways to group demonstrations."""
+    from typing import get_args
+
+    from irlcli.configs.schema import Grouping
+
+    return list(get_args(Grouping))
+
+
+def airl_penalties(incomplete: str) -> list[str]:
+    """Penalties of adversarial learners."""
+    return _penalties("airl")
+
+
+def maxent_penalties(incomplete: str) -> list[str]:
+    """Penalties of MaxEnt IRL."""
+    return _penalties("maxent")
+
+
+def _penalties(learner: str) -> list[str]:
+    from irlcli.penalties import PENALTIES
+
+    return [name for name, penalty in PENALTIES.items() if learner in penalty.learners]
+
+
+def profiles(incomplete: str) -> list[str]:
+    """Names of profiles."""
+    from irlcli.configs import PROFILES
+
+    return list(PROFILES)

@@ -1,0 +1,194 @@
+"""``irl evaluate``."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, NamedTuple
+
+import typer
+
+from irlcli.cli import arguments, returns
+from irlcli.cli.options import Env, Name, Seed, stage_command
+from irlcli.cli.session import StageSession
+from irlcli.data.descriptions import Evaluation
+from irlcli.data.descriptions import Reward as RewardDescription
+from irlcli.errors import UsageError
+from irlcli.experiments.references import by_own_reward, evaluation, tensor_file
+from irlcli.interventions import Setting, check_observed, parse_setting
+from irlcli.stages import evaluate as stage
+from irlcli.stages import train_expert
+from irlcli.stages.base import From, Request, Source
+from irlcli.stages.train_airl import describe
+from irlcli.store import Artefact
+
+
+class _Where(NamedTuple):
+    """``--ood`` or ``--intervention`` as given."""
+
+    text: str | None
+    kind: Literal["id", "ood"]
+
+
+class _Reward(NamedTuple):
+    """A learned reward that scores the episodes besides the true one."""
+
+    ref: str
+    source: Source
+    origin: RewardDescription
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Keywords of ``evaluate.request``."""
+        label = f"{describe(self.origin.airl)} seed {self.origin.seed}"
+        return {"reward": self.source, "reward_label": label}
+
+
+@stage_command
+def evaluate(
+    session: StageSession,
+    policy: Annotated[str | None, typer.Option(help="Policy: policy.pt or its artefact.")] = None,
+    expert: Annotated[bool, typer.Option("--expert", help="The expert of each setting.")] = False,
+    trained_in: Annotated[
+        str | None,
+        typer.Option(
+            help="With --expert: the experts of KNOB=VALUE,... or KNOB (ID values), each in all "
+            "settings."
+        ),
+    ] = None,
+    random: Annotated[
+        bool, typer.Option("--random", help="The agent that acts uniformly at random.")
+    ] = False,
+    idle: Annotated[bool, typer.Option("--idle", help="The agent that does nothing.")] = False,
+    reward: Annotated[
+        str | None,
+        typer.Option(help="Learned reward that also scores the episodes: reward.pt or artefact."),
+    ] = None,
+    ood: Annotated[
+        str | None,
+        typer.Option(
+            help="Settings: VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB (OOD values)."
+        ),
+    ] = None,
+    intervention: Annotated[
+        str | None, typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (ID values).")
+    ] = None,
+    env: Env = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per setting.")] = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Measure the return of a policy, an expert or a baseline."""
+    given = sum([policy is not None, expert, random, idle])
+    if given != 1:
+        raise UsageError(
+            f"{given or 'no'} agents are named, but one is needed",
+            "give one of --policy REF, --expert, --random, --idle",
+        )
+    if ood is not None and intervention is not None:
+        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    if trained_in is not None and not expert:
+        raise UsageError("--trained-in selects experts, but --expert is missing", "add --expert")
+    where = _Where(intervention, "id") if ood is None else _Where(ood, "ood")
+    scored_by = None
+    if reward is not None:
+        source, origin = tensor_file(session.store, reward, "reward")
+        arguments.check_env(reward, origin.env, env)
+        scored_by = _Reward(reward, source, origin)
+    if policy is not None:
+        requests = [_of_policy(session, policy, where, env, episodes, seed, scored_by)]
+    else:
+        agent = "expert" if expert else "random" if random else "idle"
+        requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scored_by)
+    if name is not None and len(requests) > 1:
+        raise UsageError(
+            f"--name {name!r} cannot name {len(requests)} evaluations",
+            "evaluate one expert at a time to name it",
+        )
+
+    def measured(artefact: Artefact) -> tuple[Evaluation, dict[str, Any], bool]:
+        own = scored_by is not None and by_own_reward(artefact, session.store.index())
+        return evaluation(session.store, artefact.id)[1], {}, own
+
+    artefacts = session.deliver(
+        requests, name, lambda artefact: {"returns": returns.as_json([measured(artefact)])}
+    )
+    if artefacts and not session.as_json:
+        returns.print_rows([measured(artefact) for artefact in artefacts], stderr=True)
+
+
+def _of_policy(
+    session: StageSession,
+    policy: str,
+    where: _Where,
+    env: str | None,
+    episodes: int | None,
+    seed: int,
+    scored_by: _Reward | None,
+) -> Request:
+    source, origin = tensor_file(session.store, policy, "policy")
+    arguments.check_env(policy, origin.env, env)
+    config = session.config(origin.env, {"evaluation.episodes": episodes})
+    settings: Sequence[Setting]
+    if where.text is not None:
+        settings = arguments.named_settings(origin.env, config, where.text, where.kind, origin)
+    else:
+        settings = [parse_setting(origin.env, text) for text in origin.settings]
+    if scored_by is not None:
+        arguments.check_env(scored_by.ref, scored_by.origin.env, origin.env)
+        check_observed(origin.env, scored_by.origin.settings, settings)
+    label = f"expert of {', '.join(origin.settings)}"
+    if origin.agent != "expert":
+        label = f"{origin.agent} {origin.method} of seed {origin.seed}"
+    return stage.request(
+        origin.env,
+        settings,
+        config.evaluation,
+        source,
+        seed=seed,
+        policy_label=label,
+        **({} if scored_by is None else scored_by.arguments),
+    )
+
+
+def _of_agent(
+    session: StageSession,
+    agent: Literal["expert", "random", "idle"],
+    trained_in: str | None,
+    where: _Where,
+    env: str | None,
+    episodes: int | None,
+    seed: int,
+    scored_by: _Reward | None,
+) -> list[Request]:
+    if scored_by is not None:
+        env = scored_by.origin.env
+    if env is None or where.text is None:
+        missing = "--env ENV " if env is None else ""
+        raise UsageError(
+            f"--{agent} needs the settings to evaluate in",
+            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood",
+        )
+    config = session.config(env, {"evaluation.episodes": episodes})
+    origin = None if scored_by is None else scored_by.origin
+    settings = arguments.named_settings(env, config, where.text, where.kind, origin)
+    score = {} if scored_by is None else scored_by.arguments
+    if agent != "expert":
+        return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **score)]
+    experts: list[tuple[Setting, Sequence[Setting]]]
+    if trained_in is None:
+        experts = [(setting, [setting]) for setting in settings]
+    else:
+        trained = arguments.named_settings(env, config, trained_in, "id")
+        experts = [(setting, settings) for setting in trained]
+        for setting, measured in experts:
+            check_observed(env, [str(setting)], measured)
+    return [
+        stage.request(
+            env,
+            measured,
+            config.evaluation,
+            From(train_expert.request(env, own, 0, config.expert_of(own)), "policy.pt"),
+            seed=seed,
+            policy_label=f"expert of {own}",
+            **score,
+        )
+        for own, measured in experts
+    ]

@@ -1,0 +1,145 @@
+"""``irl verify`` and ``irl gc``: damaged and unused artefacts."""
+
+from typing import Annotated, Any
+
+import typer
+
+from irlcli.cli import about
+from irlcli.cli import console as out
+from irlcli.cli.options import collecting_command, store_command
+from irlcli.cli.session import Session
+from irlcli.errors import IntegrityError, UsageError
+
+_DAY = 86400.0
+
+
+@store_command
+def verify(
+    session: Session,
+    ref: Annotated[str | None, typer.Argument(help="One artefact. Default: all.")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Compare sizes only, without hashing.")
+    ] = False,
+) -> None:
+    """Check stored bytes against their digests.
+
+    Damaged artefacts are moved to quarantine.
+    """
+    if ref is None:
+        session.check_exists()
+        ids = session.store.ids()
+    else:
+        ids = [session.artefact(ref).id]
+    found = session.store.verify(ids, quick)
+    newer = [id16 for id16, damage in found.items() if damage.newer]
+    damaged = {id16: damage for id16, damage in found.items() if not damage.newer}
+    for id16 in newer:
+        session.console.warn(f"not checked: {found[id16].problems[0]}")
+    checked = len(ids) - len(newer)
+    result: dict[str, Any] = {
+        "checked": checked,
+        "newer": newer,
+        "damaged": {
+            id16: {
+                "problems": damage.problems,
+                "command": damage.command,
+                "quarantine": str(damage.place) if damage.place is not None else None,
+            }
+            for id16, damage in damaged.items()
+        },
+    }
+    if damaged:
+        for id16, damage in damaged.items():
+            for problem in damage.problems:
+                out.print_note(f"{id16}: {problem}")
+            _print_command(id16, damage.command)
+        moved = all(damage.place is not None for damage in damaged.values())
+        state = "were damaged and are now in quarantine" if moved else "are damaged"
+        raise _with_details(
+            IntegrityError(
+                f"{len(damaged)} of {checked} artefacts {state}: {', '.join(damaged)}",
+                "run the commands above again to recompute them",
+            ),
+            result,
+        )
+    if ref is None:
+        _check_missing(session, result)
+    if session.as_json:
+        out.print_json("verify", result)
+    else:
+        out.print_data(f"{_count(checked, 'artefact')} verified")
+
+
+def _check_missing(session: Session, result: dict[str, Any]) -> None:
+    """Fail if a name points to nothing; warn if only an ancestor of a named artefact is missing."""
+    missing = session.store.missing(session.store.index(name_newer=False))
+    result["missing"] = {
+        id16: {"names": lost.names, "made": lost.made, "command": lost.command or None}
+        for id16, lost in missing.items()
+    }
+    for id16, lost in missing.items():
+        if lost.names:
+            out.print_note(lost.text(id16))
+            _print_command(id16, lost.command)
+        else:
+            session.console.warn(lost.text(id16))
+    names = sorted(name for lost in missing.values() for name in lost.names)
+    if names:
+        raise _with_details(
+            IntegrityError(
+                f"{len(names)} of {len(session.store.names())} names point to nothing: "
+                f"{', '.join(names)}",
+                "run the command that made the artefact again with the same --name, or give the "
+                "name to another artefact (irl name REF NAME)",
+            ),
+            result,
+        )
+
+
+def _print_command(id16: str, command: str) -> None:
+    if command:
+        out.print_note(f"{id16}: made by: {command}")
+
+
+def _with_details(error: IntegrityError, details: dict[str, Any]) -> IntegrityError:
+    error.details = details
+    return error
+
+
+@collecting_command
+def gc(
+    session: Session,
+    delete: Annotated[
+        bool, typer.Option("--delete", help="Delete them. Default: only list them.")
+    ] = False,
+    grace_days: Annotated[
+        float, typer.Option(min=0, help="Keep what is younger than this [days].")
+    ] = 7.0,
+) -> None:
+    """List or delete artefacts that no name depends on."""
+    if not grace_days >= 0:
+        raise UsageError(f"--grace-days {grace_days} is not a number of days", "write 0 or more")
+    session.check_exists()
+    grace = grace_days * _DAY
+    if delete:
+        artefacts, work = session.store.collect(grace)
+    else:
+        with session.reading():
+            artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
+    size = sum(output.size for artefact in artefacts for output in artefact.manifest.outputs)
+    if session.as_json:
+        value = {"deleted": delete, "artefacts": [a.id for a in artefacts], "bytes": size}
+        out.print_json("gc", {**value, "work": [path.name for path in work]})
+        return
+    for artefact in artefacts:
+        record = artefact.manifest.record
+        out.print_data(f"{artefact.id}  {record.stage}  {about.describe(record.parameters)}")
+    for path in work:
+        out.print_data(f"{path.name[:16]}  scratch of an interrupted run")
+    verb = "removed" if delete else "would be removed (add --delete)"
+    scratch = f" and scratch of {_count(len(work), 'run')}" if work else ""
+    out.print_note(f"{_count(len(artefacts), 'artefact')}, {size:,} bytes{scratch} {verb}")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,0 +1,123 @@
+"""Options that several commands share, and the decorators that add them to a command."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from irlcli.cli import complete
+from irlcli.cli.session import Session, StageSession
+
+Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of everything random.")]
+Name = Annotated[str | None, typer.Option(help="Name to give the artefact.")]
+Env = Annotated[
+    str | None,
+    typer.Option(help="Environment, e.g. lunar-lander.", autocompletion=complete.environments),
+]
+Method = Annotated[
+    str | None,
+    typer.Option(
+        help="Named grouping and penalty, e.g. erm or irm.", autocompletion=complete.methods
+    ),
+]
+Grouping = Annotated[
+    str | None,
+    typer.Option(
+        help="Demonstrations that share a risk: pooled, balanced, per-setting or shuffled.",
+        autocompletion=complete.groupings,
+    ),
+]
+PenaltyWeight = Annotated[float | None, typer.Option(help="Weight of the penalty, lambda.")]
+
+_Store = Annotated[Path, typer.Option(envvar="IRL_STORE", help="Artefact store.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print versioned JSON on stdout.")]
+_Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
+
+
+def _store_session(
+    store: _Store = Path("runs"), as_json: _Json = False, debug: _Debug = False
+) -> Session:
+    # main() reads --debug from the arguments: an error may come before they are parsed.
+    return Session(store, as_json)
+
+
+def _stage_session(
+    profile: Annotated[
+        str, typer.Option(help="smoke, standard or paper.", autocompletion=complete.profiles)
+    ] = "standard",
+    settings: Annotated[
+        Path | None, typer.Option(help="TOML file that overrides the profile.")
+    ] = None,
+    overrides: Annotated[list[str], typer.Option("--set", help="FIELD=VALUE, repeatable.")] = [],  # noqa: B006
+    sources: Annotated[
+        list[Path],
+        typer.Option(
+            "--from",
+            envvar="IRL_FROM",
+            help="Other store to copy missing artefacts from, repeatable.",
+        ),
+    ] = [],  # noqa: B006
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be done.")] = False,
+    wait: Annotated[
+        bool, typer.Option(help="Wait while another process makes the same artefact.")
+    ] = True,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that step environments.")] = 1,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on stderr.")] = False,
+    tensorboard: Annotated[
+        Path | None, typer.Option(help="Also write the metrics to this TensorBoard directory.")
+    ] = None,
+    store: _Store = Path("runs"),
+    as_json: _Json = False,
+    debug: _Debug = False,
+) -> StageSession:
+    return StageSession(
+        store,
+        as_json,
+        profile=profile,
+        file=settings,
+        overrides=overrides,
+        sources=sources,
+        dry_run=dry_run,
+        wait=wait,
+        workers=workers,
+        quiet=quiet,
+        tensorboard=tensorboard,
+    )
+
+
+def store_command(function: Callable[..., None]) -> Callable[..., None]:
+    """A command ``function(session, ...)`` on a :class:`Session`: --store, --json, --debug."""
+    return _with_options(function, _store_session)
+
+
+def collecting_command(function: Callable[..., None]) -> Callable[..., None]:
+    """As :func:`store_command`, for a command that deletes, and so must not block ``gc``."""
+    return _with_options(function, _store_session, reads=False)
+
+
+def stage_command(function: Callable[..., None]) -> Callable[..., None]:
+    """A command ``function(session, ...)`` that runs stages in a :class:`StageSession`."""
+    return _with_options(function, _stage_session)
+
+
+def _with_options(
+    function: Callable[..., None], open_session: Callable[..., Session], reads: bool = True
+) -> Callable[..., None]:
+    """``function`` with the parameters of ``open_session`` in place of its session."""
+    common = inspect.signature(open_session).parameters
+    own = list(inspect.signature(function).parameters.values())[1:]
+
+    @functools.wraps(function)
+    def run(**values: object) -> None:
+        session = open_session(**{name: values.pop(name) for name in common})
+        with session.reading() if reads else nullcontext():
+            function(session, **values)
+
+    parameters = [p.replace(kind=p.KEYWORD_ONLY) for p in (*own, *common.values())]
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return run

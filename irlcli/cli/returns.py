@@ -1,0 +1,56 @@
+"""Returns of evaluations, as a table or as JSON."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from irlcli.cli import console as out
+from irlcli.data.descriptions import Evaluation
+from irlcli.report.returns import rows
+
+# A summary, the parameters behind it that seeds share, and whether its reward is the policy's own.
+Measured = tuple[Evaluation, Mapping[str, Any], bool]
+
+
+def as_json(evaluations: Sequence[Measured]) -> list[dict[str, Any]]:
+    """A document for each agent and setting."""
+    return [
+        {
+            "agent": row.agent,
+            "env": row.env,
+            "setting": row.setting,
+            "returns": list(row.returns),
+            "mean": row.mean,
+            "std_over_seeds": row.deviation,
+            "mean_progress": row.progress,
+            "mean_learned_return": row.learned,
+            "episodes_per_seed": row.episodes,
+        }
+        for row in rows(evaluations)
+    ]
+
+
+def print_rows(evaluations: Sequence[Measured], stderr: bool = False) -> None:
+    """A table row for each agent and setting."""
+    found = rows(evaluations)
+    table = [
+        [
+            row.agent,
+            f"{row.env} {row.setting}",
+            f"{row.mean:.1f}",
+            "-" if row.deviation is None else f"{row.deviation:.1f}",
+            str(len(row.returns)),
+            str(row.episodes),
+        ]
+        for row in found
+    ]
+    columns = ["agent", "setting", "true return", "sd over seeds", "seeds", "episodes each"]
+    optional = {
+        "learned return": [row.learned for row in found],
+        "progress": [row.progress for row in found],
+    }
+    for place, (column, values) in zip((4, 3), optional.items(), strict=True):
+        if any(value is not None for value in values):
+            columns.insert(place, column)
+            for cells, value in zip(table, values, strict=True):
+                cells.insert(place, "-" if value is None else f"{value:.1f}")
+    out.print_table(columns, table, stderr=stderr)

@@ -1,0 +1,199 @@
+"""What a command works with: the store, the console, and the runner of its stages."""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from irlcli.cli import console as out
+from irlcli.errors import NotFound
+from irlcli.store import Artefact, Store
+
+if TYPE_CHECKING:
+    from irlcli.configs import Config
+    from irlcli.experiments.runner import Runner, Step
+    from irlcli.stages.base import Request
+
+
+class Session:
+    """The store that a command reads, and how it prints."""
+
+    def __init__(
+        self,
+        store: Path,
+        as_json: bool = False,
+        console: out.TerminalConsole | None = None,
+        wait: bool = True,
+    ):
+        self.console = console or out.TerminalConsole()
+        self.store = Store(store, self.console.warn)
+        self.as_json = as_json
+        self.wait = wait
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Keep gc from deleting anything while the command reads artefacts."""
+        return self.store.in_use(self.wait, partial(self.console.wait, "the store"))
+
+    def artefact(self, ref: str) -> Artefact:
+        """The artefact that ``ref`` names.
+
+        Raises:
+            NotFound: no such artefact, or a file outside the store.
+        """
+        resolved = self.store.resolve(ref)
+        if resolved.artefact is None:
+            raise NotFound(f"{ref!r} is a file outside the store", "`irl ls` lists the artefacts")
+        return resolved.artefact
+
+    def name(self, name: str, artefact: Artefact) -> None:
+        """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
+        before = self.store.set_name(name, artefact)
+        if before is not None:
+            self.console.warn(f"{name} no longer names {before}")
+
+    def check_exists(self) -> None:
+        """Refuse a store that does not exist: a mistyped path would look like an empty store.
+
+        Raises:
+            NotFound: the store's directory is missing.
+        """
+        if not self.store.root.exists():
+            raise NotFound(
+                f"there is no store at {self.store.root}",
+                "name another with --store or IRL_STORE; a command that makes an artefact "
+                "creates the store",
+            )
+
+
+class StageSession(Session):
+    """A session that plans and runs stages under a profile and its overrides."""
+
+    def __init__(
+        self,
+        store: Path,
+        as_json: bool = False,
+        *,
+        profile: str,
+        file: Path | None,
+        overrides: Sequence[str],
+        sources: Sequence[Path],
+        dry_run: bool,
+        wait: bool,
+        workers: int,
+        quiet: bool,
+        tensorboard: Path | None,
+    ):
+        from irlcli.configs import check_profile
+
+        check_profile(profile)
+        super().__init__(store, as_json, out.TerminalConsole(quiet, tensorboard), wait)
+        self.profile = profile
+        self.file = file
+        self.overrides = list(overrides)
+        self.sources = list(sources)
+        self.dry_run = dry_run
+        self.workers = workers
+
+    def config(self, env: str, flags: dict[str, Any] | None = None) -> "Config":
+        """The config of ``env`` under this session's profile and overrides."""
+        from irlcli.configs import load_config
+
+        return load_config(env, self.profile, self.file, self.overrides, flags)
+
+    def config_words(self) -> list[str]:
+        """The options that give another command line the same configs."""
+        words = ["--profile", self.profile]
+        words += [] if self.file is None else ["--settings", str(self.file)]
+        return words + [word for item in self.overrides for word in ("--set", item)]
+
+    def runner(self) -> "Runner":
+        """A runner on the session's store."""
+        from irlcli.experiments.runner import Runner
+
+        command = ["irl", *sys.argv[1:]]
+        return Runner(self.store, self.console, self.wait, command, workers=self.workers)
+
+    def deliver(
+        self,
+        requests: Sequence["Request"],
+        name: str | None = None,
+        details: Callable[[Artefact], Mapping[str, Any]] | None = None,
+    ) -> list[Artefact]:
+        """Run ``requests`` and print a line for each artefact; with ``--dry-run`` print the plan.
+
+        Args:
+            requests: what is wanted, in this order.
+            name: name of the first artefact.
+            details: what ``--json`` prints of an artefact besides its id and outputs.
+
+        Returns:
+            the artefacts; none with ``--dry-run``.
+        """
+        if name is not None:
+            # A bad name must fail before the work, not after it.
+            self.store.check_name(name)
+        runner = self.runner()
+        if self.dry_run:
+            self.print_plan([step for request in requests for step in runner.plan(request)])
+            return []
+        artefacts = []
+        # In a new store, too, gc must not delete an artefact before it has its name.
+        self.store.create()
+        with self.reading():
+            try:
+                for request in requests:
+                    artefacts.append(runner.run(request))
+            finally:
+                self.console.close()
+            if name is not None:
+                self.name(name, artefacts[0])
+        for artefact in artefacts:
+            self._print_artefact(artefact, name, details)
+        return artefacts
+
+    def prepare(self, request: "Request", then: str) -> Artefact | None:
+        """The artefact of ``request``, not printed.
+
+        With ``--dry-run`` None if it is missing; the printed plan then shows ``then`` as blocked.
+        """
+        from irlcli.experiments.runner import Step
+
+        runner = self.runner()
+        if not self.dry_run:
+            try:
+                return runner.run(request)
+            finally:
+                self.console.close()
+        steps = runner.plan(request)
+        if steps[-1].artefact is None:
+            self.print_plan([*steps, Step("BLOCKED", then, f"waits for {request.label}")])
+        return steps[-1].artefact
+
+    def print_plan(self, steps: Sequence["Step"]) -> None:
+        """A line for each step: its status, its label, and why."""
+        if self.as_json:
+            plan = [{"status": s.status, "request": s.label, "why": s.why} for s in steps]
+            out.print_json("plan", {"steps": plan})
+            return
+        for step in steps:
+            out.print_data(f"{step.status:8}{step.label}: {step.why}")
+
+    def _print_artefact(
+        self,
+        artefact: Artefact,
+        name: str | None,
+        details: Callable[[Artefact], Mapping[str, Any]] | None,
+    ) -> None:
+        if not self.as_json:
+            out.print_data(str(artefact.directory))
+            return
+        document = {
+            "id": artefact.id,
+            "path": str(artefact.directory),
+            "stage": artefact.manifest.record.stage,
+            "name": name,
+            "outputs": [output.path for output in artefact.manifest.outputs],
+        }
+        out.print_json("artefact", document | dict(details(artefact) if details else {}))
