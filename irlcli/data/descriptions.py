@@ -103,11 +103,22 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     reward_settings: tuple[str, ...] | None = None
 
 
+class EnvironmentName(Struct, frozen=True, kw_only=True):
+    """The part of a stage's ``environment`` that planning needs."""
+
+    name: str
+
+
 class Dataset(Struct, frozen=True, kw_only=True):
     """The parameters of a dataset that planning needs."""
 
-    env: str
+    environment: EnvironmentName
     settings: Settings
+
+    @property
+    def env(self) -> str:
+        """Name of its environment."""
+        return self.environment.name
 
 
 class Subject(Struct, frozen=True, kw_only=True):
