@@ -1,7 +1,6 @@
-"""What files say of themselves: rewards, policies, datasets, evaluations; checked before use.
+"""Descriptions that files carry: of rewards, policies, datasets, evaluations and summaries.
 
-A file may come from anywhere, so nothing in it is trusted to have the right form: every
-description is validated here before a field of it is used.
+A file may come from anywhere, so each description is validated here before a field of it is used.
 """
 
 from pathlib import Path
@@ -31,7 +30,7 @@ Agent = Literal["expert", "student", "transfer", "random", "idle"]
 
 
 class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Arguments of ``irl.networks.RewardModel``."""
+    """Arguments of :class:`irlcli.learners.reward_model.RewardModel`."""
 
     observation_size: Size
     action_size: Size
@@ -43,7 +42,7 @@ class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which round was kept, and its score: a mean log-likelihood, or a mean true return."""
+    """The deployed round and its score: a mean log-likelihood, or a mean true return."""
 
     round: Annotated[int, Meta(ge=0)]
     score: Finite
@@ -52,8 +51,8 @@ class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """``reward.json``, and the description inside ``reward.pt``.
 
-    ``scale`` is the standard deviation of g on the training data. ``selected`` is there if the
-    round was chosen on held-out data, else it is the last.
+    ``scale`` is the standard deviation of g on the training data. ``selected`` is None if the
+    last round is deployed.
     """
 
     env: str
@@ -78,7 +77,7 @@ class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class PolicyNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What ``rl.policy.load_policy`` rebuilds an actor-critic network from."""
+    """The actor-critic network that :func:`irlcli.rl.policy.load_policy` rebuilds."""
 
     net_arch: Widths
     activation: Activation
@@ -89,8 +88,8 @@ class PolicyNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """``policy.json``, and the description inside ``policy.pt``.
 
-    A student's ``settings`` are those it was trained in; a transferred policy also says which
-    reward it was trained on.
+    ``settings`` are those the policy was trained in. A retrained policy also names the reward it
+    was trained on (``method``, ``reward_seed``, ``reward_settings``).
     """
 
     agent: Agent
@@ -110,7 +109,7 @@ class EnvironmentName(Struct, frozen=True, kw_only=True):
 
 
 class Dataset(Struct, frozen=True, kw_only=True):
-    """The parameters of a dataset that planning needs."""
+    """What planning needs to know about demonstrations."""
 
     environment: EnvironmentName
     settings: Settings
@@ -122,7 +121,7 @@ class Dataset(Struct, frozen=True, kw_only=True):
 
 
 class Subject(Struct, frozen=True, kw_only=True):
-    """Whom an evaluation measured; ``settings`` are those that a policy was trained in."""
+    """The evaluated policy; ``settings`` are those it was trained in."""
 
     agent: Agent
     env: str
@@ -133,7 +132,7 @@ class Subject(Struct, frozen=True, kw_only=True):
 
 
 class LearnedReward(Struct, frozen=True, kw_only=True):
-    """Which reward an evaluation measured a policy by, besides the true one."""
+    """The learned reward that an evaluation measured a policy by, besides the true one."""
 
     method: MethodName
     seed: int
@@ -141,7 +140,7 @@ class LearnedReward(Struct, frozen=True, kw_only=True):
 
 
 class Returns(Struct, frozen=True, kw_only=True):
-    """True returns in one setting; of a learned reward, the mean of g / scale per episode."""
+    """Mean returns in one setting; the learned return is the mean of g / scale per episode."""
 
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
@@ -154,7 +153,7 @@ class Returns(Struct, frozen=True, kw_only=True):
 
 
 class Evaluation(Struct, frozen=True, kw_only=True):
-    """``summary.json`` of an evaluation; ``reward`` is there if it was asked for what that pays."""
+    """``summary.json`` of an evaluation; ``reward`` is None if only true returns were measured."""
 
     policy: Subject
     reward: LearnedReward | None = None
@@ -162,7 +161,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
 
 
 class SettingReturn(Struct, frozen=True, kw_only=True):
-    """What an expert earned in one setting while it was recorded."""
+    """Mean true return of an expert's demonstrations in one setting."""
 
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
@@ -170,14 +169,14 @@ class SettingReturn(Struct, frozen=True, kw_only=True):
 
 
 class Collected(Struct, frozen=True, kw_only=True):
-    """``summary.json`` of a dataset."""
+    """``summary.json`` of collect-experts."""
 
     env: str
     settings: tuple[SettingReturn, ...]
 
 
 class SettingQuality(Struct, frozen=True, kw_only=True):
-    """How the policy that is optimal for a tabular reward fares in one setting."""
+    """Quality of the policy that is optimal for a tabular reward, in one setting."""
 
     setting: str
     seen: bool
@@ -199,10 +198,10 @@ AnyForm = TypeVar("AnyForm", bound=Struct)
 
 
 def convert(value: Any, form: type[AnyForm], source: Path | str) -> AnyForm:
-    """``value`` (JSON) as a ``form``; names in it are not looked up.
+    """``value`` (JSON) as a ``form``; names of environments and settings are not checked.
 
     Raises:
-        IntegrityError: of another form; the message names ``source``.
+        IntegrityError: another form; the message names ``source``.
     """
     try:
         return msgspec.convert(value, form)
@@ -211,10 +210,10 @@ def convert(value: Any, form: type[AnyForm], source: Path | str) -> AnyForm:
 
 
 def parse(value: Any, form: type[Form], source: Path | str) -> Form:
-    """``value`` (JSON) as a description of ``form``, its environment and settings known ones.
+    """``value`` (JSON) as a ``form`` whose environment and settings exist.
 
     Raises:
-        IntegrityError: anything else; the message names ``source``.
+        IntegrityError: another form or an unknown name; the message names ``source``.
     """
     description = convert(value, form, source)
     try:

@@ -1,4 +1,4 @@
-"""Files that several stages write."""
+"""Output files that several stages write."""
 
 from __future__ import annotations
 
@@ -12,24 +12,28 @@ import pyarrow as pa
 
 from irlcli.configs import PPOConfig
 from irlcli.data import descriptions, tensors
-from irlcli.data.demonstrations import write_table
+from irlcli.data.parquet import write_table
 from irlcli.rl.policy import Policy, describe
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as JSON with sorted keys."""
+    """Write ``value`` as JSON with sorted keys.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
     path.write_text(json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n")
 
 
 def write_metrics(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write the per-round metrics as ``metrics.parquet``, one row per round and setting."""
+    """Write ``metrics.parquet``: one row per round and setting."""
     write_table(pa.Table.from_pylist(list(rows)), directory / "metrics.parquet")
 
 
 def write_policy(directory: Path, policy: Policy, ppo: PPOConfig, **origin: Any) -> None:
-    """Write ``policy.pt`` and, for readers without torch, its description ``policy.json``.
+    """Write ``policy.pt`` and its description ``policy.json``, which is readable without torch.
 
-    ``origin`` are the fields of ``descriptions.Policy`` besides the network.
+    ``origin`` holds the fields of :class:`descriptions.Policy` other than ``network``.
     """
     description = descriptions.Policy(network=describe(ppo), **origin)
     tensors.save(directory / "policy.pt", "policy", description, policy.state_dict())
@@ -37,10 +41,10 @@ def write_policy(directory: Path, policy: Policy, ppo: PPOConfig, **origin: Any)
 
 
 def write_reward(directory: Path, learner: Any, **origin: Any) -> None:
-    """Write ``reward.pt`` and, for readers without torch, its description ``reward.json``.
+    """Write ``reward.pt`` and its description ``reward.json``, which is readable without torch.
 
-    ``learner`` has the reward's ``network``, ``scale`` and ``model``; ``origin`` are the other
-    fields of ``descriptions.Reward``.
+    ``learner`` has ``network``, ``scale`` and ``model``; ``origin`` holds the other fields of
+    :class:`descriptions.Reward`.
     """
     description = descriptions.Reward(network=learner.network, scale=learner.scale, **origin)
     tensors.save(directory / "reward.pt", "reward", description, learner.model.state_dict())

@@ -1,9 +1,9 @@
-"""Tensor files: rewards, policies and stage checkpoints.
+"""Tensor files: rewards, policies and the states in checkpoints.
 
-Each is what ``torch.save`` writes for plain tensors, numbers and strings, and is read with
-``weights_only=True``: no code in a file is ever run. Equal contents give equal bytes, because
-they are written through a buffer. Rewards and policies describe themselves: a file copied out
-of the store is enough to use it.
+``torch.save`` writes them from tensors, numbers and strings; ``torch.load(weights_only=True)``
+reads them, so no code in a file is ever run (docs/threat-model.md). They are written through a
+buffer, so equal contents are equal bytes. Rewards and policies carry a description: a file
+copied out of the store can be used on its own.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from __future__ import annotations
 import io
 import json
 import pickle
-import pickletools
+import re
 import stat
-import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,36 +30,19 @@ from irlcli.learners.reward_model import RewardModel
 from irlcli.rl.policy import Policy, load_policy
 
 SCHEMA = 1
-# The networks here have tens of thousands of parameters; a larger file is not one of ours.
+# The networks here have tens of thousands of parameters.
 _MAX_BYTES = 256 << 20
-_MAX_PICKLE_BYTES = 4 << 20
-# The only globals that plain tensors, numbers, strings, dicts and lists need.
-_STORAGES = (
-    *("FloatStorage", "DoubleStorage", "LongStorage", "IntStorage", "BoolStorage"),
-    "ByteStorage",
-)
-_GLOBALS = {
-    "collections OrderedDict",
-    "torch._utils _rebuild_tensor_v2",
-    *(f"torch {name}" for name in _STORAGES),
-}
-_FORMS = {
+_KINDS = {
     "reward": descriptions.Reward,
     "tabular-reward": descriptions.TabularReward,
     "policy": descriptions.Policy,
 }
-
-
-# What a crafted archive makes zipfile, pickletools and torch raise. Not MemoryError: a machine
-# that is short of memory says nothing about a file.
-_MALFORMED = (
-    *(ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError),
-    *(AssertionError, EOFError, zipfile.BadZipFile, struct.error),
-)
+# What building a network from a description and tensors that do not fit it raises.
+_MISFIT = (KeyError, RuntimeError, TypeError, ValueError, AttributeError)
 
 
 class RefusedCode(ValueError):
-    """A tensor file names something that loading it would call."""
+    """Loading a tensor file would call a function that plain tensors do not need."""
 
 
 def to_bytes(value: Any) -> bytes:
@@ -79,42 +61,42 @@ def from_bytes(data: bytes) -> Any:
     """The value that :func:`to_bytes` wrote.
 
     Raises:
-        ValueError: any other bytes (:class:`RefusedCode` for those that would run code).
+        RefusedCode: loading would call other functions than tensors need.
+        ValueError: any other bytes.
     """
     try:
-        if data[:4] != b"PK\x03\x04":
-            # Torch would read anything else as a bare pickle.
-            raise ValueError("it is no zip archive")
+        if not data.startswith(b"PK\x03\x04"):
+            # Torch would try its formats from before 2020.
+            raise ValueError("not a zip archive")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            # As torch.save writes them: so nothing unpacks to more than was read.
-            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-                raise ValueError("its entries are compressed")
+            # torch.save does not compress. Torch would unpack a zip bomb.
             if sum(entry.file_size for entry in archive.infolist()) > len(data):
-                raise ValueError("it declares more than it holds")
-            (name,) = (n for n in archive.namelist() if n.split("/", 1)[-1] == "data.pkl")
-            if archive.getinfo(name).file_size > _MAX_PICKLE_BYTES:
-                raise ValueError(f"its index is larger than {_MAX_PICKLE_BYTES >> 20} MiB")
-            _check_globals(archive.read(name))
+                raise ValueError("its entries are larger than the file")
         return torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")
-    except RefusedCode:
-        raise
     except pickle.UnpicklingError as error:
-        raise RefusedCode(str(error).splitlines()[0]) from None
-    except _MALFORMED as error:
-        raise ValueError((str(error) or type(error).__name__).splitlines()[0][:200]) from None
+        function = re.search(r"GLOBAL (\S+)", str(error))
+        if function:
+            raise RefusedCode(f"it names {function[1][:80]!r}") from None
+        raise ValueError("its pickle is malformed") from None
+    except MemoryError:
+        # The machine may be short of memory: that proves nothing about the file.
+        raise
+    except Exception as error:
+        # A crafted archive makes zipfile and torch raise almost anything.
+        raise ValueError(_first_line(error)) from None
 
 
 def restore(data: bytes | None, names: set[str], warn: Callable[[str], None]) -> Any:
-    """The state in a stage's checkpoint, a dict of ``names``.
+    """The state in a stage's checkpoint, a dict with exactly the keys ``names``.
 
-    None for no checkpoint, and with a warning for one that cannot be used.
+    Returns None if there is no checkpoint, and warns and returns None if it cannot be used.
     """
     if data is None:
         return None
     try:
         state = from_bytes(data)
         if not isinstance(state, dict) or set(state) != names:
-            raise ValueError("it is of another stage")
+            raise ValueError("another stage wrote it")
         return state
     except ValueError as error:
         warn(f"the checkpoint cannot be used ({error}): starting over")
@@ -123,10 +105,10 @@ def restore(data: bytes | None, names: set[str], warn: Callable[[str], None]) ->
 
 @contextmanager
 def fitting(directory: Path, *errors: type[Exception]) -> Iterator[None]:
-    """Name the scratch ``directory`` whose checkpoint holds a state that raises ``errors``.
+    """Report ``errors`` as a checkpoint in the scratch ``directory`` that does not fit its stage.
 
     Raises:
-        IntegrityError: a state that somebody made, or another version of the program.
+        IntegrityError: instead of one of ``errors``.
     """
     try:
         yield
@@ -137,16 +119,8 @@ def fitting(directory: Path, *errors: type[Exception]) -> Iterator[None]:
         ) from None
 
 
-def _check_globals(data: bytes) -> None:
-    """Refuse a pickle with other globals than ours: ``weights_only`` allows some that allocate."""
-    for opcode, argument, _ in pickletools.genops(data):
-        named = opcode.name in ("GLOBAL", "INST")
-        if (named and argument not in _GLOBALS) or opcode.name == "STACK_GLOBAL":
-            raise RefusedCode(f"it names {str(argument)[:80]!r}")
-
-
 def save(path: Path, kind: str, description: Struct, state: dict[str, Any]) -> None:
-    """Write a tensor file of ``kind`` (a key of ``_FORMS``) that describes itself."""
+    """Write a tensor file of ``kind`` (reward, tabular-reward or policy) with its description."""
     text = msgspec.json.encode(description, order="sorted").decode()
     path.write_bytes(
         to_bytes({"kind": kind, "schema": SCHEMA, "description": text, "state": state})
@@ -157,45 +131,44 @@ def load(path: Path, kind: str) -> tuple[Any, dict[str, Any]]:
     """(description, state) of the tensor file ``path``, which must be of ``kind``.
 
     Raises:
-        UsageError: it is a tensor file of another kind.
+        UsageError: a tensor file of another kind.
         IntegrityError: not a tensor file, damaged, of a newer schema, or one that would run code.
     """
     value = _read(path)
+    hint = f"training stages write {kind} files"
     if not isinstance(value, dict) or not {"kind", "schema", "description", "state"} <= set(value):
-        raise IntegrityError(
-            f"{path} is no file of irlcli", f"a {kind} comes from a training stage"
-        )
-    if value["kind"] != kind:
-        if isinstance(value["kind"], str) and value["kind"] in _FORMS:
-            raise UsageError(f"{path} is a {value['kind']}, not a {kind}", f"name a {kind} file")
-        raise IntegrityError(f"{path} is of no known kind", f"a {kind} comes from a training stage")
+        raise IntegrityError(f"{path} was not written by irlcli", hint)
+    found = value["kind"]
+    if not isinstance(found, str) or found not in _KINDS:
+        raise IntegrityError(f"{path} is of an unknown kind", hint)
+    if found != kind:
+        raise UsageError(f"{path} is a {found}, not a {kind}", f"name a {kind} file")
     if type(value["schema"]) is not int:
-        raise IntegrityError(f"{path} has no schema", f"a {kind} comes from a training stage")
+        raise IntegrityError(f"{path} has no schema version", hint)
     if value["schema"] > SCHEMA:
         raise NewerFormat(str(path), value["schema"], SCHEMA)
     try:
-        text = value["description"]
-        description = json.loads(text) if isinstance(text, str) else None
-    except (ValueError, RecursionError):
+        description = json.loads(value["description"])
+    except (TypeError, ValueError, RecursionError):
         description = None
     if not isinstance(description, dict) or not isinstance(value["state"], dict):
         raise IntegrityError(f"{path} has no readable description")
-    return descriptions.parse(description, _FORMS[kind], path), value["state"]
+    return descriptions.parse(description, _KINDS[kind], path), value["state"]
 
 
 def _read(path: Path) -> Any:
     try:
         information = path.stat()
         if not stat.S_ISREG(information.st_mode):
-            # Opening a named pipe would wait for a writer that never comes.
-            raise IntegrityError(f"{path} is not a plain file")
+            # Opening a named pipe would wait for a writer forever.
+            raise IntegrityError(f"{path} is not a regular file")
         if information.st_size > _MAX_BYTES:
             raise IntegrityError(f"{path} is larger than {_MAX_BYTES >> 20} MiB")
         return from_bytes(path.read_bytes())
     except RefusedCode as error:
         raise IntegrityError(
-            f"{path} holds more than tensors and was refused: loading it could run code ({error})",
-            "a file of irlcli holds tensors only; do not trust where this one came from",
+            f"{path} was refused: loading it could run code ({error})",
+            "files of irlcli hold tensors only; do not trust the source of this one",
         ) from None
     except ValueError as error:
         raise IntegrityError(f"{path} is not a tensor file ({error})") from None
@@ -207,34 +180,45 @@ def load_policy_file(path: Path) -> tuple[Policy, descriptions.Policy]:
     """A policy and its description.
 
     Raises:
-        UsageError, IntegrityError: as :func:`load`; also tensors that do not fit the description.
+        UsageError, IntegrityError: as :func:`load`; also tensors that do not fit the description
+            or are not finite.
     """
     description, state = load(path, "policy")
     try:
         setting = parse_setting(description.env, description.settings[0])
         policy = load_policy(description.env, setting, description.network, state)
-        return policy, description
-    except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+    except _MISFIT as error:
         raise _misfit(path, error) from None
+    _check_finite(path, policy.state_dict())
+    return policy, description
 
 
 def load_reward_file(path: Path) -> tuple[RewardModel, descriptions.Reward]:
     """A reward model, frozen, and its description.
 
     Raises:
-        UsageError, IntegrityError: as :func:`load`; also tensors that do not fit the description.
+        UsageError, IntegrityError: as :func:`load`; also tensors that do not fit the description
+            or are not finite.
     """
     description, state = load(path, "reward")
     try:
         model = RewardModel(**msgspec.structs.asdict(description.network))
         model.load_state_dict(state)
-    except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+    except _MISFIT as error:
         raise _misfit(path, error) from None
-    if not all(bool(torch.isfinite(tensor).all()) for tensor in model.state_dict().values()):
-        raise IntegrityError(f"{path} holds numbers that are not finite")
+    _check_finite(path, model.state_dict())
     return model.requires_grad_(False).eval(), description
 
 
+def _check_finite(path: Path, state: dict[str, torch.Tensor]) -> None:
+    for name, tensor in state.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise IntegrityError(f"{path}: {name} holds numbers that are not finite")
+
+
 def _misfit(path: Path, error: Exception) -> IntegrityError:
-    reason = (str(error) or type(error).__name__).splitlines()[0]
-    return IntegrityError(f"{path}: its tensors do not fit its description ({reason})")
+    return IntegrityError(f"{path}: its tensors do not fit its description ({_first_line(error)})")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0][:200]

@@ -84,7 +84,7 @@ def run(job: Job) -> None:
     import numpy as np
     import pyarrow as pa
 
-    from irlcli.data.demonstrations import write_table
+    from irlcli.data.parquet import write_table
     from irlcli.data.outputs import write_json
     from irlcli.data.tensors import load_policy_file, load_reward_file
     from irlcli.envs.registration import make

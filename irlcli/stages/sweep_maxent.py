@@ -113,7 +113,7 @@ def run(job: Job) -> None:
     import torch
 
     from irlcli.data import tensors as checkpoints
-    from irlcli.data.demonstrations import write_table
+    from irlcli.data.parquet import write_table
     from irlcli.envs.gridworld import tasks as gridworlds
     from irlcli.learners import maxent
 

@@ -1,0 +1,72 @@
+"""Parquet files: written in one form, opened within limits (docs/threat-model.md)."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+# What reading raises for damaged and for crafted files.
+UNREADABLE = (pa.ArrowException, KeyError, TypeError, ValueError, OSError, RecursionError)
+
+_MAX_FILE_BYTES = 8 << 30
+# A kilobyte of Parquet can stand for terabytes; recorded numbers compress far less than 100 times.
+_MAX_DECODED_BYTES = 2 << 30
+_MAX_RATIO = 100
+
+
+def writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """A writer of ``path`` with zstd compression and page checksums."""
+    return pq.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True)
+
+
+def write_table(table: pa.Table, path: Path) -> None:
+    """Write ``table`` as one row group."""
+    with writer(path, table.schema) as file:
+        file.write_table(table, row_group_size=max(1, table.num_rows))
+
+
+def open_table(path: Path, texts: Sequence[str] = ()) -> pq.ParquetFile:
+    """Open ``path`` and check its footer; no column is read yet.
+
+    The columns ``texts`` are read as dictionaries: a long text repeated in every row then takes
+    its memory once.
+
+    Raises:
+        ValueError: not a regular file, or too large, compressed or decoded.
+        OSError, ArrowException: not readable as Parquet.
+    """
+    information = path.stat()
+    if not stat.S_ISREG(information.st_mode):
+        # Opening a named pipe would wait for a writer forever.
+        raise ValueError("not a regular file")
+    size = information.st_size
+    if size > _MAX_FILE_BYTES:
+        raise ValueError(f"larger than {_MAX_FILE_BYTES >> 30} GiB")
+    file = pq.ParquetFile(path, read_dictionary=list(texts), page_checksum_verification=True)
+    declared = _declared_bytes(file)
+    if declared > max(_MAX_DECODED_BYTES, _MAX_RATIO * size):
+        file.close()
+        raise ValueError(f"{size:,} bytes declare {declared:,} bytes of data")
+    return file
+
+
+def _declared_bytes(file: pq.ParquetFile) -> int:
+    """Size of the decoded columns by the footer: fixed-width values and uncompressed pages.
+
+    Column chunks are not inspected: ``RowGroupMetaData.column`` aborts the process on some
+    crafted footers (pyarrow 26), which reading reports as errors.
+    """
+    groups = [file.metadata.row_group(i) for i in range(file.num_row_groups)]
+    width = sum(_width(kind) for kind in file.schema_arrow.types)
+    return sum(group.num_rows * width + group.total_byte_size for group in groups)
+
+
+def _width(kind: pa.DataType) -> int:
+    """Bytes of a decoded value; 0 for types of variable width."""
+    if pa.types.is_fixed_size_list(kind):
+        return kind.list_size * _width(kind.value_type)
+    return -(-kind.bit_width // 8) if pa.types.is_primitive(kind) else 0
