@@ -1,0 +1,127 @@
+"""Each kind of extension is one file and one line: done here in a temporary package.
+
+The files are those of docs/extending.md; the line is an entry of the registry that it names.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from irlcli import learners, penalties, rl
+from irlcli.envs import registry
+from irlcli.experiments.runner import Runner
+from irlcli.stages.base import From
+from irlcli.store import Store
+
+PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
+
+
+def example(name):
+    """The code block of docs/extending.md that begins with ``# lab/NAME.py``."""
+    blocks = re.findall(r"```(?:python|toml)\n(.*?)```", PAGE.read_text(), re.S)
+    (block,) = (b for b in blocks if re.match(rf"# \S*{re.escape(name)}\n", b))
+    return block
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    """``lab("vrex.py")`` writes the page's file into a package ``lab`` that can be imported."""
+    package = tmp_path / "packages" / "lab"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    monkeypatch.syspath_prepend(package.parent)
+
+    def write(name):
+        (package / name).write_text(example(name))
+        return package / name
+
+    yield write
+    import sys
+
+    for module in [m for m in sys.modules if m == "lab" or m.startswith("lab.")]:
+        del sys.modules[module]
+
+
+def trained(irl, store, *more):
+    """The id of a reward learned from the smoke store's demonstrations."""
+    common = ["--store", store.path, "--profile", "smoke", "--quiet"]
+    done = irl("train-airl", "--demos", "demos", *more, *common)
+    assert done.code == 0, done.err
+    return Store(store.path).resolve(done.out.strip().rpartition("/")[2]).artefact
+
+
+def test_a_penalty(irl, lab, store_copy, monkeypatch):
+    lab("vrex.py")
+    unknown = ["train-airl", "--demos", "demos", "--grouping", "per-setting", "--penalty", "v-rex"]
+    assert irl(*unknown, "--store", store_copy.path, "--profile", "smoke").code == 2
+    monkeypatch.setitem(penalties.PENALTIES, "v-rex", penalties.Penalty("lab.vrex", ("airl",)))
+    artefact = trained(irl, store_copy, "--grouping", "per-setting", "--penalty", "v-rex")
+    assert artefact.manifest.record.parameters["airl"]["penalty"] == "v-rex"
+    metrics = artefact.directory / "metrics.parquet"
+    import pyarrow.parquet as pq
+
+    values = pq.read_table(metrics)["optimised_penalty"].to_pylist()
+    # A variance of risks: never negative, and of two different settings not zero.
+    assert min(values) >= 0.0 and max(values) > 0.0
+
+
+def test_a_learner(irl, lab, store_copy, monkeypatch):
+    lab("gail.py")
+    monkeypatch.setitem(learners.LEARNERS, "gail", "lab.gail:GAIL")
+    gail = trained(irl, store_copy, "--set", "airl.learner=gail")
+    airl = trained(irl, store_copy)
+    assert gail.manifest.record.parameters["airl"]["learner"] == "gail"
+    policies = [(a.directory / "policy.pt").read_bytes() for a in (gail, airl)]
+    assert policies[0] != policies[1]
+
+
+def test_an_algorithm(irl, lab, store_copy, monkeypatch):
+    lab("one_epoch.py")
+    monkeypatch.setitem(rl.ALGORITHMS, "one-epoch", "lab.one_epoch:OneEpoch")
+    common = ["--ood", "1.5x", "--store", store_copy.path, "--profile", "smoke", "--quiet"]
+    done = irl("transfer", "--reward", "airl", "--set", "transfer.algorithm=one-epoch", *common)
+    assert done.code == 0, done.err
+    made = Store(store_copy.path).resolve(done.out.strip().rpartition("/")[2]).artefact
+    assert made.id != store_copy.transfer
+    assert made.manifest.record.parameters["transfer"]["algorithm"] == "one-epoch"
+
+
+def test_an_environment(irl, lab, tmp_path, monkeypatch):
+    lab("slide.py")
+    settings = tmp_path / "settings"
+    settings.mkdir()
+    (settings / "slide.toml").write_text(example("slide.toml"))
+    monkeypatch.setattr("irlcli.configs.load.settings_directory", lambda: settings)
+    from lab.slide import SPEC
+
+    monkeypatch.setitem(registry.ENVIRONMENTS, SPEC.name, SPEC)
+    common = ["--store", tmp_path / "runs", "--profile", "smoke", "--quiet", "--name"]
+    for arguments in (
+        ["collect-experts", "--env", "slide", "--intervention", "drag", *common, "demos"],
+        ["train-airl", "--demos", "demos", "--method", "irm", *common, "irm"],
+        ["transfer", "--reward", "irm", "--ood", "drag", *common, "moved"],
+        ["evaluate", "--policy", "moved", *common, "score"],
+    ):
+        done = irl(*arguments)
+        assert done.code == 0, done.err
+    assert "slide drag=0.9" in done.err
+
+
+def test_a_stage(lab, store_copy):
+    lab("count_steps.py")
+    from lab import count_steps
+
+    runner = Runner(store_copy.path)
+    demos = runner.store.resolve("demos").artefact
+    from irlcli.experiments.runner import source_of
+    from irlcli.store import Resolved
+
+    source = source_of(Resolved(demos, demos.directory))
+    first, again = (runner.run(count_steps.request(source)) for _ in range(2))
+    assert first.id == again.id
+    steps = int((first.directory / "steps.txt").read_text())
+    import pyarrow.parquet as pq
+
+    assert steps == pq.read_table(demos.directory / "steps.parquet").num_rows
+    assert isinstance(From(count_steps.request(source)).request.parameters, object)
