@@ -65,7 +65,11 @@ def fields(name: str, section: str) -> dict[str, str]:
 
 
 def method_name(learner: str, grouping: str, penalty: str) -> str:
-    """The name of a combination; the combination itself where it has no name."""
+    """The name of a combination; the combination itself where it has no name.
+
+    ``maxent`` shares the names of AIRL's methods: what it trains is never mistaken for AIRL's.
+    """
+    learner = "airl" if learner == "maxent" else learner
     for known in METHODS.values():
         if (known.learner, known.grouping, known.penalty) == (learner, grouping, penalty):
             return known.name

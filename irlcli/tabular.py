@@ -1,15 +1,15 @@
 """Finite Markov decision processes as exact arrays, and dynamic programming over many of them.
 
 Transitions are factored through *afterstates* (Sutton and Barto 2018, Sec. 6.8): an action leads
-from s to an afterstate without chance, chance leads from there to s',
+from s to an afterstate deterministically, and chance leads from there to s',
 
     P(s' | s, a) = sum_k probability[afterstate[a, s], k] * [successor[afterstate[a, s], k] = s'].
 
-In a gridworld the afterstate is the intended cell, so the sparse part is shared by the actions;
-any finite MDP has this form with one afterstate per (s, a). Time and memory are linear in states.
+In a gridworld the afterstate is the intended cell, so all actions share the sparse part. Any finite
+MDP has this form with one afterstate per (s, a). Time and memory are linear in the states.
 
-Everything is batched over E settings (MDPs of one shape, side by side as one sparse MDP) and over
-R rewards. Arrays that the solver passes on keep R last, so that a sparse row acts on all R at once.
+Everything is batched over E settings (MDPs of one shape, stacked as one block-diagonal MDP) and
+over R rewards. Internal arrays keep R last, so that a sparse row acts on all R at once.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-DENSE_LIMIT = 1024  # states; four actions then take 32 MiB
+DENSE_LIMIT = 1024  # states; with four actions that takes 32 MiB
 MEMORY_LIMIT = 8 * 2**30  # bytes
 TIE_TOLERANCE = 1e-9  # relative: actions whose values differ by less are equally good
 
@@ -38,7 +38,7 @@ class TabularMDP:
         goal: the goal's state index.
 
     Raises:
-        ValueError: shapes that do not fit, indices out of range, or rows that are no distribution.
+        ValueError: shapes that do not fit, indices out of range, or rows that do not sum to one.
     """
 
     afterstate: np.ndarray
@@ -81,12 +81,12 @@ class TabularMDP:
 
     @property
     def terminal(self) -> np.ndarray:
-        """[S] bool: the states in which the episode has ended, so that nothing is chosen."""
+        """[S] bool: the states in which the episode has ended and nothing is chosen."""
         return (self.probability == 0.0).all(1)[self.afterstate].all(0)
 
 
 def dense_transitions(mdp: TabularMDP) -> np.ndarray:
-    """P(s'|s, a) as [A, S, S] float64, for tiny cases and for checking.
+    """P(s'|s, a) as [A, S, S] float64, for small cases and for checks.
 
     Raises:
         ValueError: more than ``DENSE_LIMIT`` states.
@@ -102,7 +102,7 @@ def dense_transitions(mdp: TabularMDP) -> np.ndarray:
 
 
 def shortest_path_length(mdp: TabularMDP) -> int:
-    """The fewest steps from any possible first state to the goal if every move goes as intended.
+    """The fewest steps from any possible first state to the goal if every move succeeds.
 
     Raises:
         ValueError: the goal cannot be reached.
@@ -123,21 +123,27 @@ def shortest_path_length(mdp: TabularMDP) -> int:
 
 @dataclass(frozen=True, eq=False)
 class StackedMDPs:
-    """E MDPs of one shape, as one block-diagonal sparse MDP over E * S states.
+    """E MDPs of one shape, as one block-diagonal sparse MDP over E * S states; see :func:`stack`.
 
-    Made by :func:`stack`. ``spread`` [E*X, E*S] takes values of states to values of afterstates;
-    ``collect`` [E*X, A*E*S] adds up what the actions send to each afterstate; ``arrivals``
-    [E*X, E*S] counts the actions that lead from a state to an afterstate.
+    Attributes:
+        mdps: the E MDPs.
+        afterstate: [A, E*S] int64.
+        spread: [E*X, E*S], maps values of states to values of afterstates.
+        spread_transposed: [E*S, E*X].
+        collect: [E*X, A*E*S], sums the probability that the actions send to each afterstate.
+        arrivals: [E*X, E*S], counts the actions that lead from a state to an afterstate.
+        terminal: [E*S] bool.
+        start: [E, S], distribution of the first state.
     """
 
     mdps: tuple[TabularMDP, ...]
-    afterstate: np.ndarray  # [A, E*S] int64
+    afterstate: np.ndarray
     spread: sparse.csr_array
     spread_transposed: sparse.csr_array
     collect: sparse.csr_array
     arrivals: sparse.csr_array
-    terminal: np.ndarray  # [E*S] bool
-    start: np.ndarray  # [E, S]
+    terminal: np.ndarray
+    start: np.ndarray
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -146,10 +152,10 @@ class StackedMDPs:
 
 
 def stack(mdps: Sequence[TabularMDP]) -> StackedMDPs:
-    """Put ``mdps`` side by side.
+    """Stack ``mdps`` into one.
 
     Raises:
-        ValueError: none given, or their shapes differ.
+        ValueError: no MDP, or MDPs of different shapes.
     """
     if not mdps:
         raise ValueError("at least one MDP is needed")
@@ -220,7 +226,7 @@ def backward(
         after = settings.spread @ value
         if discount != 1.0:
             after *= discount
-        # The indices are known to be in range; "clip" lets take write without a buffer.
+        # All indices are in range; with "clip", take writes to ``out`` without a buffer.
         after.take(settings.afterstate, axis=0, out=policy[t], mode="clip")
         value = backup(policy[t])
         value += flat
@@ -234,7 +240,7 @@ def forward(
 
     Returns:
         The occupancy sum_{t=0..H} gamma^t P(s_t = s) [R, E, S], and P(s_H = s) [R, E, S]. An
-        episode that has ended is in no state, so that a distribution may sum to less than one.
+        episode that has ended is in no state, so P(s_H) may sum to less than one.
     """
     horizon, a, e, n, runs = policy.shape
     state = columns(settings, np.broadcast_to(settings.start, (runs, e, n)))
@@ -251,24 +257,24 @@ def forward(
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """How a policy fares at the true task, [R, E]."""
+    """How a policy performs at the true task, [R, E]."""
 
     goal_probability: np.ndarray  # of having reached the goal within the horizon
-    true_return: np.ndarray  # undiscounted, as the environment pays it: for s_0 .. s_{H-1}
+    true_return: np.ndarray  # undiscounted, over s_0 .. s_{H-1} as the environment computes it
 
 
 def evaluate(settings: StackedMDPs, policy: np.ndarray) -> Evaluation:
     """Exact evaluation of ``policy`` [H, A, E, S, R] by the true reward of each setting.
 
-    The goal must keep whoever reaches it, or end the episode.
+    The goal must be absorbing or terminal.
     """
     occupancy, last = forward(settings, policy)
     goals = np.array([m.goal for m in settings.mdps])
     e = np.arange(len(goals))
     reached = 1.0 - last.sum(-1) + last[:, e, goals]
     reward = np.stack([m.reward for m in settings.mdps])
-    paid = ((occupancy - last) * reward).sum(-1)
-    return Evaluation(np.clip(reached, 0.0, 1.0), paid)
+    true_return = ((occupancy - last) * reward).sum(-1)
+    return Evaluation(np.clip(reached, 0.0, 1.0), true_return)
 
 
 def optimal_policy(
@@ -292,16 +298,28 @@ def optimal_policy(
     return backward(settings, reward, horizon, hard_backup)
 
 
+def intended_path(mdp: TabularMDP, policy: np.ndarray) -> np.ndarray:
+    """The states [H + 1] that ``policy`` [H, A, S] visits if every move succeeds.
+
+    It begins in the first possible state. Among equally likely actions it takes the first.
+    """
+    states = [int(mdp.start.argmax())]
+    for step in policy:
+        after = mdp.afterstate[step[:, states[-1]].argmax(), states[-1]]
+        states.append(int(mdp.successor[after, 0]))
+    return np.array(states)
+
+
 def true_reward(settings: StackedMDPs) -> np.ndarray:
     """[1, E, S]: the true rewards, as :func:`backward` takes them."""
     return np.stack([m.reward for m in settings.mdps])[None]
 
 
 def columns(settings: StackedMDPs, array: np.ndarray) -> np.ndarray:
-    """[R, S] or [R, E, S] as [E * S, R], or as [E * S] if R = 1: half the time of one column.
+    """[R, S] or [R, E, S] as [E * S, R]; as [E * S] if R = 1, which takes half the time.
 
     Raises:
-        ValueError: another shape, or numbers that are not finite.
+        ValueError: another shape, or values that are not finite.
     """
     e, n, _ = settings.shape
     array = np.asarray(array, dtype=np.float64)
@@ -323,7 +341,7 @@ def runs_first(settings: StackedMDPs, array: np.ndarray) -> np.ndarray:
 
 
 def check_size(horizon: int, discount: float, numbers: int) -> None:
-    """Refuse what :func:`backward` cannot solve, or what keeps too many ``numbers`` per step.
+    """Refuse what the solvers cannot do, or cannot hold: they keep ``numbers`` for every step.
 
     Raises:
         ValueError: a horizon below 1, a discount outside (0, 1], or more than ``MEMORY_LIMIT``.

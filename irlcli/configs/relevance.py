@@ -91,7 +91,7 @@ def relevant_transfer(transfer: TransferConfig, discrete_actions: bool) -> Trans
 
 
 def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:
-    """``maxent`` without what its method and its features leave unused.
+    """``maxent`` without what its penalty and its features leave unused.
 
     Raises:
         UsageError: a penalty that MaxEnt IRL does not have.
@@ -99,7 +99,8 @@ def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:
     check_penalty(maxent.penalty, "maxent")
     if maxent.penalty == "none" or maxent.penalty_weight == 0.0:
         maxent = replace(maxent, penalty="none", penalty_weight=0.0)
-        if maxent.grouping == "per-setting":
+        if maxent.grouping in ("per-setting", "shuffled"):
+            # Both weigh settings equally, and only a penalty looks at the groups.
             maxent = replace(maxent, grouping="balanced")
     if maxent.features == "linear":
         maxent = replace(maxent, hidden=_MAXENT.hidden)

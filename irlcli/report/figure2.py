@@ -1,7 +1,7 @@
-"""Paper Fig. 2: recovered rewards as pictures, and beside them what they are worth.
+"""Paper Fig. 2: pictures of recovered rewards, beside measures of how good they are.
 
-A picture of one dataset's reward persuades easily; the table and the curves are over all datasets,
-with bootstrap 95 % intervals. The dataset is the unit of the statistics.
+The pictures show one dataset only. The table and the curves are means over all datasets, with
+bootstrap 95 % intervals: the dataset is the unit of the statistics.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ MEASURES = (
     "rank_correlation",
     "log_likelihood",
 )
-# Okabe and Ito's colours, told apart by colour-blind readers too.
+# Okabe and Ito's colours, which colour-blind readers can tell apart.
 GROUP_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 
 
 def summary(quality: pd.DataFrame) -> pd.DataFrame:
     """Mean and interval over seeds of each measure, per variant and setting.
 
-    ``worst`` stands for the worst of the settings trained on, seed by seed. A rank correlation
-    that does not exist (a constant value) counts as 0: such a reward ranks nothing.
+    The setting ``worst`` is the worst of the settings trained on, seed by seed. An undefined rank
+    correlation (of a constant value) counts as 0.
     """
     filled = quality.fillna({"rank_correlation": 0.0})
     worst = filled[filled["seen"]].copy()
@@ -65,17 +65,17 @@ def summary(quality: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def table(found: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows, a row per variant: ``mean [low, high]`` over datasets."""
+def table(summarised: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Column names, and a row per variant; its cells are ``mean [low, high]`` over datasets."""
     wanted = [("goal probability, worst trained", "goal_probability", "worst", 2)]
     wanted += [(f"goal probability, {u}", "goal_probability", u, 2) for u in unseen]
     wanted += [(f"true return, {u}", "true_return", u, 1) for u in unseen]
     wanted += [(f"value difference, {u}", "value_difference", u, 1) for u in unseen]
     wanted += [("log-likelihood, worst trained", "log_likelihood", "worst", 1)]
     wanted += [(f"rank correlation, {u}", "rank_correlation", u, 2) for u in unseen]
-    cells = found.set_index(["variant", "measure", "setting"])
+    cells = summarised.set_index(["variant", "measure", "setting"])
     rows = []
-    for variant in dict.fromkeys(found["variant"]):
+    for variant in dict.fromkeys(summarised["variant"]):
         row = [variant]
         for _, measure, setting, digits in wanted:
             c = cells.loc[(variant, measure, setting)]
@@ -87,21 +87,20 @@ def table(found: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[l
 def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:
     """(weight, variant) along each sweep, from weight 0: IRM by penalty, and the L2 of ERM."""
     rows = quality.drop_duplicates("variant")
-    irm = rows[(rows["method"] == "irm") & ~rows["shuffled"]]
-    found = {
-        f"IRM {penalty}": [
-            (0.0, "erm-balanced"),
-            *zip(group["penalty_weight"], group["variant"], strict=True),
-        ]
+    balanced, irm, erm = (
+        rows[rows["grouping"] == grouping] for grouping in ("balanced", "per-setting", "pooled")
+    )
+    start = [(0.0, variant) for variant in balanced["variant"]]
+    points = {
+        f"IRM {penalty}": [*start, *zip(group["penalty_weight"], group["variant"], strict=True)]
         for penalty, group in irm.groupby("penalty", sort=False)
     }
-    erm = rows[rows["method"] == "erm"]
-    return {**found, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
+    return {**points, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One recovered reward: [S], and the routes [T + 1] of its optimal policy by setting."""
+    """One recovered reward [S], and by setting the route [T + 1] of its optimal policy."""
 
     title: str
     reward: np.ndarray
@@ -110,13 +109,13 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Maze:
-    """What the panels are drawn on.
+    """What the panels are drawn over.
 
     Attributes:
         size: cells a side.
-        paths: for each setting trained on, the experts' trajectories of state indices.
-        gates: for each setting trained on, its walls [S] bool.
-        bars: for each unseen setting, its walls [S] bool.
+        paths: by setting trained on, the experts' trajectories of state indices.
+        gates: by setting trained on, its walls [S] bool.
+        bars: by unseen setting, its walls [S] bool.
     """
 
     size: int
@@ -129,24 +128,24 @@ def draw(
     directory: Path,
     maze: Maze,
     panels: Sequence[Panel],
-    found: pd.DataFrame,
+    summarised: pd.DataFrame,
     lines: Mapping[str, Sequence[tuple[float, str]]],
     seed: int,
 ) -> None:
     """Write ``figure2.png`` and ``figure2.pdf``.
 
     Args:
-        panels: seven, beside the experts' paths.
-        found: as :func:`summary` returns it.
+        panels: seven; the eighth place shows the experts' paths.
+        summarised: as :func:`summary` returns it.
         lines: as :func:`curves` returns them.
         seed: the dataset that the panels show.
     """
     caption = (
-        f"Dataset {seed}, not chosen for its looks. (b)-(h): the recovered reward of each cell, on "
-        "its own colour scale. White crosses: the bars of the unseen mazes\n(blocked=1 the left "
-        "one, blocked=2 both). Orange: where the reward's optimal policy goes in blocked=1 (solid) "
-        "and blocked=2 (dotted) if no move slips; a dot where it ends.\nCurves and table: means "
-        f"over {found['datasets'].iloc[0]} datasets, with bootstrap 95 % intervals."
+        f"Pictures: dataset {seed}, the first one. (b)-(h): recovered reward of each cell, each "
+        "panel on its own colour scale. White crosses: the bars of the unseen mazes\n(blocked=1 has "
+        "the left one, blocked=2 both). Orange: route of the reward's optimal policy in blocked=1 "
+        "(solid) and blocked=2 (dotted) if no move slips; it ends at the dot.\nCurves and table: "
+        f"means over {summarised['datasets'].iloc[0]} datasets, with bootstrap 95 % intervals."
     )
     with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
         figure = plt.figure(figsize=(15, 16), layout="constrained")
@@ -157,8 +156,8 @@ def draw(
         _draw_experts(axes[0], maze)
         for k, (axis, panel) in enumerate(zip(axes[1:], panels, strict=True)):
             _draw_reward(figure, axis, maze, panel, chr(ord("b") + k))
-        _draw_curves(figure, grid[2].subgridspec(1, 3), found, lines, list(maze.bars))
-        _draw_table(figure.add_subplot(grid[3]), found, list(maze.bars))
+        _draw_curves(figure, grid[2].subgridspec(1, 3), summarised, lines, list(maze.bars))
+        _draw_table(figure.add_subplot(grid[3]), summarised, list(maze.bars))
         figure.savefig(directory / "figure2.png", dpi=130)
         figure.savefig(directory / "figure2.pdf", metadata={"CreationDate": None})
         plt.close(figure)
@@ -199,7 +198,7 @@ def _draw_experts(axis, maze: Maze) -> None:
                 path % size + jitter[0], path // size + jitter[1], color=colour, lw=0.8, alpha=0.5
             )
         axis.plot([], [], color=colour, lw=2, label=f"{setting.partition('=')[2]}: {len(paths)}")
-    # Below the maze: its every corner is gate or path.
+    # Below the maze, because gates and paths fill its corners.
     axis.legend(
         title=f"{setting.partition('=')[0]}: episodes",
         loc="upper center",
@@ -233,8 +232,8 @@ def _draw_reward(figure, axis, maze: Maze, panel: Panel, letter: str) -> None:
     axis.set_title(f"({letter}) {panel.title}")
 
 
-def _draw_curves(figure, places, found, lines, unseen: Sequence[str]) -> None:
-    cells = found.set_index(["variant", "measure", "setting"])
+def _draw_curves(figure, places, summarised, lines, unseen: Sequence[str]) -> None:
+    cells = summarised.set_index(["variant", "measure", "setting"])
     what = [(f"goal probability, {u} (unseen)", "goal_probability", u) for u in unseen[:2]]
     what.append(("log-likelihood, worst trained setting [nats]", "log_likelihood", "worst"))
     for k, (title, measure, setting) in enumerate(what):
@@ -256,8 +255,8 @@ def _draw_curves(figure, places, found, lines, unseen: Sequence[str]) -> None:
             axis.legend(fontsize=8)
 
 
-def _draw_table(axis, found: pd.DataFrame, unseen: Sequence[str]) -> None:
-    columns, rows = table(found, unseen)
+def _draw_table(axis, summarised: pd.DataFrame, unseen: Sequence[str]) -> None:
+    columns, rows = table(summarised, unseen)
     keep = [i for i, c in enumerate(columns) if not c.startswith("value difference")]
     axis.axis("off")
     drawn = axis.table(

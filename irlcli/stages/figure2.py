@@ -1,4 +1,6 @@
-"""Paper Fig. 2 from a sweep: the pictures of one dataset, the numbers of all."""
+"""Paper Fig. 2 from a sweep: pictures of one dataset's rewards, numbers from all datasets."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 
@@ -7,13 +9,15 @@ import msgspec
 from irlcli.configs import Config
 from irlcli.interventions import Setting
 from irlcli.stages import sweep_maxent
-from irlcli.stages.base import From, Job, Request, Stage
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage
+from irlcli.stages.sweep_maxent import PAPER_L2, PAPER_PENALTY_WEIGHTS, PENALTIES, Variant
+from irlcli.stages.train_maxent import indexed, read_gridworld
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the figure depends on, besides the sweep; ``seed`` is the dataset that is drawn."""
 
-    env: str
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seed: int
@@ -30,7 +34,7 @@ def request(
     sweep = sweep_maxent.request(env, settings_, unseen, config)
     drawn = sweep_maxent.datasets(env, settings_, config)[0]
     parameters = Parameters(
-        env=env,
+        environment=sweep.parameters.environment,
         settings=sweep.parameters.settings,
         unseen=sweep.parameters.unseen,
         seed=drawn.parameters.seed,
@@ -39,63 +43,64 @@ def request(
     return Request(STAGE, parameters, inputs, f"figure2 {env}")
 
 
+def panels() -> list[tuple[Variant, str]]:
+    """The variants whose rewards are drawn, with their titles."""
+    drawn = [
+        (Variant(grouping="pooled"), "ERM"),
+        (Variant(grouping="pooled", l2=PAPER_L2), f"ERM + L2 {PAPER_L2:g}"),
+        (Variant(grouping="balanced"), "ERM-balanced"),
+    ]
+    for penalty in PENALTIES:
+        for weight in PAPER_PENALTY_WEIGHTS:
+            variant = Variant(grouping="per-setting", penalty=penalty, penalty_weight=weight)
+            drawn.append((variant, f"IRM {penalty}, $\\lambda$ = {weight:g}"))
+    return drawn
+
+
 def run(job: Job) -> None:
-    """Draw; nothing is fitted here."""
+    """Summarise the sweep and draw; nothing is fitted here."""
     import numpy as np
     import pandas as pd
 
-    from irlcli import tabular
-    from irlcli.envs.gridworld import tasks as gridworlds
+    from irlcli.envs.gridworld import tasks
     from irlcli.envs.gridworld.env import walls
     from irlcli.interventions import env_kwargs, parse_setting
     from irlcli.report import figure2, tables
+    from irlcli.tabular import intended_path, optimal_policy
 
     p: Parameters = job.parameters
-    grid, dataset = gridworlds.read(job.inputs["demonstrations"], p.env, p.settings)
+    env = p.environment.name
+    grid, episodes = read_gridworld(job.inputs["demonstrations"], env, p.settings)
     rewards = pd.read_parquet(job.inputs["sweep"] / "rewards.parquet")
     rewards = rewards[rewards["seed"] == p.seed].set_index("variant")["reward"]
     quality = pd.read_parquet(job.inputs["sweep"] / "quality.parquet")
-    found = figure2.summary(quality)
-    seen, unseen = (gridworlds.stacked(texts, grid) for texts in (p.settings, p.unseen))
-    demos = gridworlds.indexed(seen, list(dataset.trajectories.values()), grid)
+    summary = figure2.summary(quality)
+    seen, unseen = (tasks.stacked(texts, grid) for texts in (p.settings, p.unseen))
+    demos = indexed(seen, episodes, grid)
 
-    def route(policy, e):
-        """Where the optimal policy leads if no move slips, one way of those equally good."""
-        mdp, state, states = unseen.mdps[e], 0, [0]
-        for t in range(grid.horizon):
-            after = mdp.afterstate[policy[t, :, e, state, 0].argmax(), state]
-            state = int(mdp.successor[after, 0])
-            states.append(state)
-        return np.array(states)
+    def panel(variant: Variant, title: str) -> figure2.Panel:
+        reward = np.asarray(rewards[str(variant)])
+        policy, _ = optimal_policy(unseen, reward[None], grid.horizon)
+        routes = {
+            text: intended_path(mdp, policy[:, :, e, :, 0])
+            for e, (text, mdp) in enumerate(zip(p.unseen, unseen.mdps, strict=True))
+        }
+        return figure2.Panel(title, reward, routes)
 
-    def panel(variant, title):
-        reward = np.asarray(rewards[variant])
-        policy, _ = tabular.optimal_policy(unseen, reward[None], grid.horizon)
-        return figure2.Panel(title, reward, {u: route(policy, e) for e, u in enumerate(p.unseen)})
-
-    def wall(texts):
+    def wall(texts: Sequence[str]) -> dict[str, np.ndarray]:
         return {
-            text: walls(grid.size, **env_kwargs(p.env, parse_setting(p.env, text)))
-            for text in texts
+            text: walls(grid.size, **env_kwargs(env, parse_setting(env, text))) for text in texts
         }
 
-    l2 = sweep_maxent.PAPER_L2
-    panels = [
-        panel("erm", "ERM"),
-        panel(f"erm l2 {l2:g}", f"ERM + L2 {l2:g}"),
-        panel("erm-balanced", "ERM-balanced"),
-    ]
-    panels += [
-        panel(f"irm {kind} {weight:g}", f"IRM {kind}, $\\lambda$ = {weight:g}")
-        for kind in sweep_maxent.PENALTIES
-        for weight in sweep_maxent.PAPER_PENALTY_WEIGHTS
-    ]
     paths = dict(zip(p.settings, demos.states, strict=True))
     maze = figure2.Maze(grid.size, paths, wall(p.settings), wall(p.unseen))
-    figure2.draw(job.output, maze, panels, found, figure2.curves(quality), p.seed)
-    found.to_csv(job.output / "figure2.csv", index=False, float_format="%.6g", lineterminator="\n")
-    text = tables.markdown_table(*figure2.table(found, p.unseen))
+    drawn = [panel(variant, title) for variant, title in panels()]
+    figure2.draw(job.output, maze, drawn, summary, figure2.curves(quality), p.seed)
+    summary.to_csv(
+        job.output / "figure2.csv", index=False, float_format="%.6g", lineterminator="\n"
+    )
+    text = tables.markdown_table(*figure2.table(summary, p.unseen))
     (job.output / "figure2.md").write_text(text)
 
 
-STAGE = Stage("figure2", 2, run)
+STAGE = Stage("figure2", 3, run)

@@ -1,75 +1,80 @@
-"""Every method of paper Fig. 2 on many datasets at once: rewards, and how good they are."""
+"""Every method of paper Fig. 2 on many datasets at once: the rewards, and how good they are."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
 
 import msgspec
+from msgspec.structs import asdict, replace
 
 from irlcli.configs import Config, Figure2Config, GridworldConfig, MaxEntConfig
+from irlcli.configs.relevance import relevant_maxent
 from irlcli.interventions import Setting, check_tabular
 from irlcli.stages import collect_experts
-from irlcli.stages.base import From, Job, Request, Stage
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
+from irlcli.stages.train_maxent import indexed, judge, read_gridworld
+
+# The penalties that Figure 2 compares; the paper's L2 weight of ERM and its lambdas of IRM.
+PENALTIES = ("irmv1", "closed-form")
+PAPER_L2 = 1e-3
+PAPER_PENALTY_WEIGHTS = (0.01, 0.05)
+_NAMES = {"pooled": "erm", "balanced": "erm-balanced", "per-setting": "irm"}
+
+
+class Variant(msgspec.Struct, frozen=True, kw_only=True):
+    """One method of the sweep; the fields are those of :class:`irlcli.configs.MaxEntConfig`."""
+
+    grouping: str
+    penalty: str = "none"
+    penalty_weight: float = 0.0
+    l2: float = 0.0
+
+    def __str__(self) -> str:
+        """For example ``erm l2 0.1`` or ``irm-shuffled irmv1 0.05``."""
+        parts = [_NAMES.get(self.grouping, f"irm-{self.grouping}")]
+        if self.penalty != "none":
+            parts.append(f"{self.penalty} {self.penalty_weight:g}")
+        if self.l2:
+            parts.append(f"l2 {self.l2:g}")
+        return " ".join(parts)
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the sweep depends on, besides its datasets (``seeds``, in the order of the inputs).
 
-    Of ``maxent``, the method, the penalty and its weight, and l2 are swept over.
+    The fields of a :class:`Variant` have their defaults in ``maxent``.
     """
 
-    env: str
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seeds: tuple[int, ...]
-    penalty_weights: tuple[float, ...]
-    l2s: tuple[float, ...]
+    variants: tuple[Variant, ...]
     gridworld: GridworldConfig
     maxent: MaxEntConfig
 
 
-class Variant(NamedTuple):
-    """One method as fitted; ``shuffled`` deals the demonstrations out to settings at random."""
+def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Variant, ...]:
+    """The baselines, then each penalty at all lambdas, and its control at the paper's lambdas.
 
-    method: str
-    penalty: str
-    penalty_weight: float
-    l2: float
-    shuffled: bool
-
-    def __str__(self) -> str:
-        parts = [self.method]
-        if self.l2:
-            parts.append(f"l2 {self.l2:g}")
-        if self.method == "irm":
-            parts.append(f"{self.penalty} {self.penalty_weight:g}")
-        if self.shuffled:
-            parts.append("shuffled")
-        return " ".join(parts)
-
-
-PENALTIES = ("irmv1", "closed-form")
-PAPER_L2 = 1e-3
-PAPER_PENALTY_WEIGHTS = (0.01, 0.05)
-
-
-def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> Iterator[Variant]:
-    """The baselines, then for each penalty its lambdas and the paper's with shuffled labels.
-
-    IRM with lambda 0 is ERM-balanced, which therefore stands at the low end of every sweep.
+    IRM with lambda 0 is ERM-balanced, which is therefore the low end of every sweep over lambda.
     """
-    yield Variant("erm", PENALTIES[0], 0.0, 0.0, False)
-    for l2 in sorted({*l2s, PAPER_L2} - {0.0}):
-        yield Variant("erm", PENALTIES[0], 0.0, l2, False)
-    yield Variant("erm-balanced", PENALTIES[0], 0.0, 0.0, False)
+    weights = sorted({*penalty_weights, *PAPER_PENALTY_WEIGHTS} - {0.0})
+    found = [Variant(grouping="pooled", l2=l2) for l2 in sorted({*l2s, PAPER_L2, 0.0})]
+    found.append(Variant(grouping="balanced"))
     for penalty in PENALTIES:
-        for weight in sorted({*penalty_weights, *PAPER_PENALTY_WEIGHTS} - {0.0}):
-            yield Variant("irm", penalty, weight, 0.0, False)
-        for weight in PAPER_PENALTY_WEIGHTS:
-            yield Variant("irm", penalty, weight, 0.0, True)
+        for grouping, swept in (("per-setting", weights), ("shuffled", PAPER_PENALTY_WEIGHTS)):
+            found += [
+                Variant(grouping=grouping, penalty=penalty, penalty_weight=weight)
+                for weight in swept
+            ]
+    return tuple(found)
 
 
 def datasets(env: str, settings_: Sequence[Setting], config: Config) -> list[Request]:
-    """The demonstrations that the sweep learns from, one request a seed."""
+    """The demonstrations that the sweep learns from, one request per seed."""
     f: Figure2Config = config.figure2
     return [
         collect_experts.request(env, settings_, config, seed, f.episodes)
@@ -91,15 +96,16 @@ def request(
     check_tabular(env, "sweep-maxent", wanted=True)
     texts = tuple(str(s) for s in settings_)
     requests = datasets(env, settings_, config)
+    # What the variants replace, and the defaults of what they leave unused.
+    unswept = replace(config.maxent, **asdict(Variant(grouping="pooled")))
     parameters = Parameters(
-        env=env,
+        environment=environment_key(env),
         settings=texts,
         unseen=tuple(str(s) for s in unseen),
         seeds=tuple(r.parameters.seed for r in requests),
-        penalty_weights=config.figure2.penalty_weights,
-        l2s=config.figure2.l2s,
+        variants=variants(config.figure2.penalty_weights, config.figure2.l2s),
         gridworld=config.gridworld,
-        maxent=config.maxent,
+        maxent=relevant_maxent(unswept),
     )
     inputs = {f"demonstrations {r.parameters.seed}": From(r) for r in requests}
     label = f"sweep-maxent {env} {', '.join(texts)} {len(requests)} datasets"
@@ -107,63 +113,49 @@ def request(
 
 
 def run(job: Job) -> None:
-    """One fit a penalty, of all its variants and seeds side by side."""
+    """Fit all variants and datasets of one penalty side by side, one penalty after the other."""
     import numpy as np
     import pyarrow as pa
     import torch
 
-    from irlcli.data import tensors as checkpoints
-    from irlcli.data.parquet import write_table
-    from irlcli.envs.gridworld import tasks as gridworlds
-    from irlcli.learners import maxent
+    from irlcli.data import tensors
+    from irlcli.data.demonstrations import write_table
+    from irlcli.envs.gridworld import tasks
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
-    grid = p.gridworld
-    settings = gridworlds.stacked(p.settings, grid)
-    occupancy: dict[bool, list[Any]] = {False: [], True: []}
+    settings = tasks.stacked(p.settings, p.gridworld)
+    demos = {}
     for seed in p.seeds:
         path = job.inputs[f"demonstrations {seed}"]
-        _, dataset = gridworlds.read(path, p.env, p.settings)
-        demos = gridworlds.indexed(settings, list(dataset.trajectories.values()), grid)
-        counts = demos.counts
-        for shuffled in (False, True):
-            if shuffled:
-                demos = maxent.shuffle_settings(demos, seed)
-            occupancy[shuffled].append(maxent.expert_occupancy(settings, demos, grid.horizon))
-    found = list(variants(p.penalty_weights, p.l2s))
-    state = checkpoints.restore(job.checkpoints.load(), {"rewards", "fit"}, job.console.warn)
-    with checkpoints.fitting(job.output.parent, Exception):
+        _, episodes = read_gridworld(path, p.environment.name, p.settings)
+        demos[seed] = indexed(settings, episodes, p.gridworld)
+    penalties = list(dict.fromkeys(v.penalty for v in p.variants))
+    state = tensors.restore(job.checkpoints.load(), {"rewards", "fit"}, job.console.warn)
+    with tensors.fitting(job.output.parent, Exception):
         rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
-    while len(rewards) < len(PENALTIES):
-        penalty = PENALTIES[len(rewards)]
-        chosen = [v for v in found if v.penalty == penalty]
-        fit = _fit(
-            job,
-            settings,
-            [seed for _ in chosen for seed in p.seeds],
-            [v for v in chosen for _ in p.seeds],
-            np.concatenate([occupancy[v.shuffled] for v in chosen]),
-            counts,
-            rewards,
-            None if state is None else state["fit"],
-        )
-        rewards.append(fit.reward)
-        state = None
-    runs = [(v, seed) for kind in PENALTIES for v in found if v.penalty == kind for seed in p.seeds]
+    runs: list[tuple[Variant, int]] = []
+    for k, penalty in enumerate(penalties):
+        chosen = list(product([v for v in p.variants if v.penalty == penalty], p.seeds))
+        runs += chosen
+        if k == len(rewards):
+            rewards.append(_fit(job, settings, demos, chosen, rewards, state and state["fit"]))
+            state = None
     reward = np.concatenate(rewards)
-    rows = [
-        {"variant": str(v), **v._asdict(), "seed": seed, "reward": reward[r]}
+    rows: list[dict[str, Any]] = [
+        {"variant": str(v), **asdict(v), "seed": seed, "reward": reward[r]}
         for r, (v, seed) in enumerate(runs)
     ]
     write_table(pa.Table.from_pylist(rows), job.output / "rewards.parquet")
     rows = []
     for texts, seen in ((p.settings, True), (p.unseen, False)):
-        measures = gridworlds.quality(texts, grid, reward, p.maxent.held_out) if texts else {}
+        if not texts:
+            continue
+        measures = vars(judge(texts, p.gridworld, reward, p.maxent.held_out))
         rows += [
             {
                 "variant": str(v),
-                **v._asdict(),
+                **asdict(v),
                 "seed": seed,
                 "setting": text,
                 "seen": seen,
@@ -175,44 +167,50 @@ def run(job: Job) -> None:
     write_table(pa.Table.from_pylist(rows), job.output / "quality.parquet")
 
 
-def _fit(job, settings, seeds, runs, occupancy, counts, rewards, state):
-    """Fit one reward for each of ``runs`` (variants), all of one penalty; ``rewards`` are done."""
+def _fit(job, settings, demos, runs, rewards, state):
+    """The rewards [R, S] of ``runs`` (variant, seed), all of one penalty.
+
+    ``rewards`` are those of earlier penalties, ``state`` is where an interrupted fit stood.
+    """
     import numpy as np
     import torch
 
-    from irlcli.data import tensors as checkpoints
-    from irlcli.envs.gridworld import tasks as gridworlds
-    from irlcli.learners import maxent
+    from irlcli.data import tensors
+    from irlcli.envs.gridworld import tasks
+    from irlcli.learners.maxent import MaxEnt, group_risks
 
     p: Parameters = job.parameters
-    m = p.maxent
-
-    def after_record(done, state):
-        total = m.iterations * len(PENALTIES)
-        job.console.progress(m.iterations * len(rewards) + done, total, "iterations", {})
-        job.checkpoints.offer(
-            lambda: checkpoints.to_bytes(
-                {"rewards": [torch.as_tensor(r) for r in rewards], "fit": state()}
-            )
-        )
-
-    with gridworlds.usable_input(), checkpoints.fitting(job.output.parent, maxent.UnfitState):
-        return maxent.fit(
+    m, horizon = p.maxent, p.gridworld.horizon
+    with tasks.usable_input():
+        learner = MaxEnt(
             settings,
-            gridworlds.inputs(m.inputs, p.gridworld),
-            occupancy,
-            np.stack([maxent.setting_weights(v.method, counts) for v in runs]),
-            np.array([v.penalty_weight for v in runs]),
-            np.array([v.l2 for v in runs]),
-            seeds,
-            penalty_kind=runs[0].penalty,
-            horizon=p.gridworld.horizon,
+            tasks.features(m.inputs, p.gridworld),
+            [group_risks(settings, demos[seed], v.grouping, horizon, seed) for v, seed in runs],
+            np.array([v.penalty_weight for v, _ in runs]),
+            np.array([v.l2 for v, _ in runs]),
+            [seed for _, seed in runs],
+            penalty=runs[0][0].penalty,
+            horizon=horizon,
             hidden=m.hidden if m.features == "learned" else 0,
-            iterations=m.iterations,
             learning_rate=m.learning_rate,
-            state=state,
-            after_record=after_record,
+        )
+    if state is not None:
+        with tensors.fitting(job.output.parent, Exception):
+            learner.load_state_dict(state)
+    # Larger fits take longer, so progress counts iterations of single rewards.
+    before = m.iterations * sum(map(len, rewards))
+    total = m.iterations * len(p.variants) * len(p.seeds)
+
+    def after_record() -> None:
+        done = before + learner.iterations * len(runs)
+        job.console.progress(done, total, "iterations", {})
+        kept = [torch.as_tensor(reward) for reward in rewards]
+        job.checkpoints.offer(
+            lambda: tensors.to_bytes({"rewards": kept, "fit": learner.state_dict()})
         )
 
+    with tasks.usable_input():
+        return learner.fit(m.iterations, after_record=after_record)
 
-STAGE = Stage("sweep-maxent", 1, run)
+
+STAGE = Stage("sweep-maxent", 2, run)

@@ -1,18 +1,41 @@
 """Maximum-entropy IRL on a gridworld's demonstrations, solved exactly (paper Sec. 4.2, 5.1)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from irlcli.configs import MaxEntConfig
+from irlcli.configs import GridworldConfig, MaxEntConfig
+from irlcli.configs.relevance import relevant_maxent
+from irlcli.errors import IntegrityError
 from irlcli.interventions import Setting, check_tabular
-from irlcli.stages.base import From, Job, Request, Source, Stage
+from irlcli.methods import method_name
+from irlcli.stages.base import (
+    EnvironmentKey,
+    From,
+    Job,
+    Request,
+    Source,
+    Stage,
+    environment_key,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from irlcli.learners.occupancy import Demonstrations
+    from irlcli.learners.tabular_quality import Quality
+    from irlcli.tabular import StackedMDPs
+    from irlcli.trajectories import Trajectory
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What a learned reward depends on, besides its demonstrations, which say of which grid."""
+    """What a learned reward depends on, besides its demonstrations, which record their grid."""
 
-    env: str
+    environment: EnvironmentKey
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seed: int
@@ -31,78 +54,97 @@ def request(
 
     Outputs ``reward.pt`` (a tensor file of kind ``tabular-reward``), its description as JSON,
     ``metrics.parquet`` with a row per record and setting, and ``quality.json``: how the policy
-    that is optimal for the reward fares at the true task, in ``settings_`` and in ``unseen``.
+    that is optimal for the reward performs at the true task, in ``settings_`` and in ``unseen``.
 
     Raises:
-        UsageError: an environment that is not tabular.
+        UsageError: an environment that is not tabular, or a penalty that MaxEnt IRL does not have.
     """
     check_tabular(env, "train-maxent", wanted=True)
     texts = tuple(str(s) for s in settings_)
     parameters = Parameters(
-        env=env, settings=texts, unseen=tuple(str(s) for s in unseen), seed=seed, maxent=maxent
+        environment=environment_key(env),
+        settings=texts,
+        unseen=tuple(str(s) for s in unseen),
+        seed=seed,
+        maxent=relevant_maxent(maxent),
     )
-    kind = f" {maxent.penalty} lambda {maxent.penalty_weight:g}" if maxent.method == "irm" else ""
-    label = f"train-maxent {maxent.method}{kind} {env} {', '.join(texts)} seed {seed}"
+    label = f"train-maxent {describe(parameters.maxent)} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, {"demonstrations": demos}, label)
 
 
+def describe(maxent: MaxEntConfig) -> str:
+    """The method in a label: its name, its lambda and its L2."""
+    parts = [method_name("maxent", maxent.grouping, maxent.penalty)]
+    if maxent.penalty != "none":
+        parts.append(f"lambda {maxent.penalty_weight:g}")
+    if maxent.l2:
+        parts.append(f"l2 {maxent.l2:g}")
+    return " ".join(parts)
+
+
 def run(job: Job) -> None:
-    """Fit one reward; checkpoints after each record of the fit's progress."""
+    """Fit the reward, then judge it in every setting."""
     import numpy as np
     import torch
 
-    from irlcli.data import descriptions
-    from irlcli.data import tensors as checkpoints
+    from irlcli.data import descriptions, tensors
     from irlcli.data.outputs import write_json, write_metrics
-    from irlcli.envs.gridworld import tasks as gridworlds
-    from irlcli.learners import maxent
+    from irlcli.envs.gridworld import tasks
+    from irlcli.learners.maxent import MaxEnt, group_risks
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
     m = p.maxent
-    grid, dataset = gridworlds.read(job.inputs["demonstrations"], p.env, p.settings)
-    settings = gridworlds.stacked(p.settings, grid)
-    demos = gridworlds.indexed(settings, list(dataset.trajectories.values()), grid)
-
-    def after_record(done, state):
-        job.console.progress(done, m.iterations, "iterations", {})
-        job.checkpoints.offer(lambda: checkpoints.to_bytes(state()))
-
-    names = {"iterations", "networks", "optimizer", "records"}
-    with gridworlds.usable_input(), checkpoints.fitting(job.output.parent, maxent.UnfitState):
-        fit = maxent.fit(
+    grid, episodes = read_gridworld(job.inputs["demonstrations"], p.environment.name, p.settings)
+    settings = tasks.stacked(p.settings, grid)
+    demos = indexed(settings, episodes, grid)
+    with tasks.usable_input():
+        learner = MaxEnt(
             settings,
-            gridworlds.inputs(m.inputs, grid),
-            maxent.expert_occupancy(settings, demos, grid.horizon)[None],
-            maxent.setting_weights(m.method, demos.counts)[None],
-            np.array([m.penalty_weight if m.method == "irm" else 0.0]),
+            tasks.features(m.inputs, grid),
+            [group_risks(settings, demos, m.grouping, grid.horizon, p.seed)],
+            np.array([m.penalty_weight]),
             np.array([m.l2]),
             [p.seed],
-            penalty_kind=m.penalty,
+            penalty=m.penalty,
             horizon=grid.horizon,
             hidden=m.hidden if m.features == "learned" else 0,
-            iterations=m.iterations,
             learning_rate=m.learning_rate,
-            state=checkpoints.restore(job.checkpoints.load(), names, job.console.warn),
-            after_record=after_record,
         )
+    names = set(learner.state_dict())
+    state = tensors.restore(job.checkpoints.load(), names, job.console.warn)
+    if state is not None:
+        with tensors.fitting(job.output.parent, Exception):
+            learner.load_state_dict(state)
+
+    def after_record() -> None:
+        job.console.progress(learner.iterations, m.iterations, "iterations", {})
+        job.checkpoints.offer(lambda: tensors.to_bytes(learner.state_dict()))
+
+    with tasks.usable_input():
+        reward = learner.fit(m.iterations, after_record=after_record)
     description = descriptions.TabularReward(
-        env=p.env, settings=p.settings, method=m.method, seed=p.seed, gridworld=grid, maxent=m
+        env=p.environment.name,
+        settings=p.settings,
+        method=method_name("maxent", m.grouping, m.penalty),
+        seed=p.seed,
+        gridworld=grid,
+        maxent=m,
     )
-    tensors = {"reward": torch.as_tensor(fit.reward[0]), **fit.networks.state_dict()}
-    checkpoints.save(job.output / "reward.pt", "tabular-reward", description, tensors)
+    weights = {"reward": torch.as_tensor(reward[0]), **learner.networks.state_dict()}
+    tensors.save(job.output / "reward.pt", "tabular-reward", description, weights)
     write_json(job.output / "reward.json", msgspec.to_builtins(description))
     write_metrics(
         job.output,
         [
             {
-                "iteration": int(i),
+                "iteration": record.iteration,
                 "setting": text,
-                "log_likelihood": float(fit.objective[k, 0, e]),
-                "penalty": float(fit.penalty[k, 0, e]),
-                "occupancy_gap": float(fit.gap[k, 0, e]),
+                "log_likelihood": float(record.log_likelihood[0, e]),
+                "optimised_penalty": float(record.penalty[0]),
+                "occupancy_gap": float(record.occupancy_gap[0, e]),
             }
-            for k, i in enumerate(fit.iterations)
+            for record in learner.records
             for e, text in enumerate(p.settings)
         ],
     )
@@ -110,17 +152,82 @@ def run(job: Job) -> None:
     for texts, seen in ((p.settings, True), (p.unseen, False)):
         if not texts:
             continue
-        found = gridworlds.quality(texts, grid, fit.reward, m.held_out)
+        measures = vars(judge(texts, grid, reward, m.held_out))
         rows += [
-            {"setting": text, "seen": seen, **{k: _number(a[0, e]) for k, a in found.items()}}
+            {"setting": text, "seen": seen, **{k: _number(a[0, e]) for k, a in measures.items()}}
             for e, text in enumerate(texts)
         ]
     write_json(job.output / "quality.json", {"settings": rows})
 
 
+def read_gridworld(
+    directory: Path, env: str, texts: Sequence[str]
+) -> tuple[GridworldConfig, list[tuple[Trajectory, ...]]]:
+    """The grid of the demonstrations in ``directory``, and their episodes by setting.
+
+    Raises:
+        IntegrityError: damaged, or of another environment or other settings than expected.
+    """
+    from irlcli.data.demonstrations import read_demonstrations
+
+    demos = read_demonstrations(directory)
+    if demos.env != env or list(demos.trajectories) != list(texts):
+        raise IntegrityError(
+            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, not of "
+            f"{env} {', '.join(texts)}"
+        )
+    try:
+        grid = msgspec.convert(demos.metadata["gridworld"], GridworldConfig)
+    except (KeyError, msgspec.ValidationError) as error:
+        raise IntegrityError(
+            f"the demonstrations in {directory} do not describe their gridworld ({error})"
+        ) from None
+    return grid, list(demos.trajectories.values())
+
+
+def indexed(
+    settings: StackedMDPs, episodes: Sequence[Sequence[Trajectory]], grid: GridworldConfig
+) -> Demonstrations:
+    """The episodes of each setting as state and action indices.
+
+    Raises:
+        UsageError: episodes of another grid, or longer than its horizon.
+    """
+    from irlcli.envs.gridworld import tasks
+    from irlcli.envs.gridworld.env import state_indices
+    from irlcli.learners.occupancy import demonstrations
+
+    with tasks.usable_input():
+        states = [[state_indices(t.observations, grid.size) for t in group] for group in episodes]
+        actions = [[t.actions for t in group] for group in episodes]
+        return demonstrations(settings, states, actions, grid.horizon)
+
+
+def judge(
+    texts: Sequence[str], grid: GridworldConfig, reward: np.ndarray, held_out: int
+) -> Quality:
+    """How good ``reward`` [R, S] is in each of E settings.
+
+    The held-out episodes are ``held_out`` new ones of each setting's own expert, the same for
+    every reward.
+
+    Raises:
+        UsageError: a goal that cannot be reached, or a grid too large to solve.
+    """
+    from irlcli.envs.gridworld import tasks
+    from irlcli.learners.tabular_quality import assess
+
+    settings = tasks.stacked(texts, grid)
+    # A dataset's entropy is two numbers, so three are never a dataset's.
+    episodes = [tasks.sample(t, grid, held_out, (0, e, held_out)) for e, t in enumerate(texts)]
+    demos = indexed(settings, episodes, grid)
+    with tasks.usable_input():
+        return assess(settings, reward, grid.horizon, demos)
+
+
 def _number(x: float) -> float | None:
-    """JSON has no NaN: the rank correlation of a constant value is null."""
+    """JSON has no NaN, so the rank correlation of a constant value becomes null."""
     return None if x != x else float(x)
 
 
-STAGE = Stage("train-maxent", 1, run)
+STAGE = Stage("train-maxent", 2, run)

@@ -1,20 +1,20 @@
 """The gridworld of paper Sec. 5.1: from the bottom left to the top right, on slippery ground.
 
-The same cells, walls and chances as exact arrays (for the tractable solver and the experts) and as
-a gymnasium environment. A cell (x, y) is state ``y * size + x``, y upwards, and is observed as
-(x, y) / (size - 1), float32, from which :func:`state_indices` gives the state back exactly.
+The same maze as exact arrays (for the tractable solver and the experts) and as a gymnasium
+environment. A cell (x, y) is state ``y * size + x``, y upwards. Its observation is
+(x, y) / (size - 1), float32, which :func:`state_indices` inverts exactly.
 
-Actions are up, right, down, left. The cell an action aims at is the *target*: the next cell, or
-the same one if that is a wall or outside. With probability 1 - p_slip the agent lands on the
-target, with p_slip uniformly on one of the target's four neighbours; a neighbour that is a wall or
-outside counts as the target. No slip leads through a wall.
+Actions are up, right, down, left. An action's *target* is the next cell, or the same cell if the
+next one is a wall or outside. With probability 1 - p_slip the agent lands on the target, else on
+one of the target's four neighbours, each equally likely. A neighbour that is a wall or outside
+counts as the target, so no slip leads through a wall.
 
 The true reward is the same in every setting: -1 for each step that starts outside the goal.
 
-StackedMDPs differ in walls only. Every path crosses the anti-diagonal, which ``path_group`` closes but
+Settings differ in walls only. Every path crosses the anti-diagonal. ``path_group`` closes it except
 for one gate: 1 at the top left, 2 at the bottom right, 3 in the middle (paper Fig. 2a). ``blocked``
-puts bars, of other cells than the gates', across the first or the first two groups' corridors:
-MDPs that nobody demonstrates in.
+puts bars across the corridors of the first group, or of the first two, in cells that belong to no
+gate. No expert demonstrates in these mazes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from irlcli.trajectories import Trajectory
 Goal = Literal["terminal", "absorbing"]
 PATH_GROUPS = (1, 2, 3)
 _MOVES = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)])  # (dx, dy) of up, right, down, left
-_LARGEST = 1024  # cells a side: a million states
+_LARGEST = 1024  # cells per side: a million states
 _SMALLEST_WITH_PATHS = 5
 
 
@@ -38,9 +38,9 @@ def walls(size: int, path_group: float = 0, blocked: float = 0) -> np.ndarray:
     """[S] bool, True where a wall stands.
 
     Args:
-        size: cells a side, at least 2 (at least 5 for anything but open ground).
-        path_group: the gate left open, 1, 2 or 3; 0 for no gates.
-        blocked: how many of groups 1 and 2 find a bar across their corridor, 0, 1 or 2.
+        size: cells per side, at least 2 (at least 5 with gates or bars).
+        path_group: the open gate, 1, 2 or 3; 0 for no gates.
+        blocked: the number of barred corridors: 0, 1 (group 1) or 2 (groups 1 and 2).
 
     Raises:
         ValueError: a number outside its range, or a grid too small to hold the walls.
@@ -77,12 +77,12 @@ def gridworld(
 ) -> TabularMDP:
     """The gridworld as exact arrays: A = 4, S = size^2, K = 5.
 
-    The last of its S + 1 afterstates is where every action in the goal leads: the goal for ever
-    (``absorbing``), or the end of the episode (``terminal``).
+    Every action in the goal leads to the last of its S + 1 afterstates, which stays at the goal
+    (``absorbing``) or ends the episode (``terminal``).
 
     Raises:
-        ValueError: as :func:`walls`; an unknown goal; p_slip outside [0, 1); or walls that keep
-            the goal from being reached.
+        ValueError: as :func:`walls`; an unknown goal; p_slip outside [0, 1); or walls that make
+            the goal unreachable.
     """
     wall = walls(size, path_group, blocked)
     if goal not in ("terminal", "absorbing"):
@@ -133,7 +133,7 @@ def state_indices(observation: np.ndarray, size: int) -> np.ndarray:
         raise ValueError(f"observations outside a gridworld of size {size}")
     state = (position[..., 1] * size + position[..., 0]).astype(np.int64)
     if not np.array_equal(observations(size)[state], observation.astype(np.float32)):
-        raise ValueError(f"observations that no cell of a gridworld of size {size} has")
+        raise ValueError(f"observations that match no cell of a gridworld of size {size}")
     return state
 
 
@@ -143,7 +143,7 @@ def expert_policy(mdp: TabularMDP, horizon: int) -> np.ndarray:
     Equally good actions are equally likely.
 
     Raises:
-        ValueError: the goal is further away than the horizon.
+        ValueError: the goal is more steps away than the horizon.
     """
     settings = stack([mdp])
     return optimal_policy(settings, true_reward(settings), horizon)[0][:, :, 0, :, 0]
@@ -154,8 +154,8 @@ def sample_trajectories(
 ) -> list[Trajectory]:
     """``episodes`` trajectories of ``policy`` [H, A, S], the i-th from seed ``seed + i``.
 
-    An episode terminates where the MDP ends it and is truncated after H steps otherwise. Each
-    depends on its own seed only, whatever else is sampled along with it.
+    An episode terminates where the MDP ends it, and is truncated after H steps otherwise. It
+    depends on its own seed only.
 
     Raises:
         ValueError: fewer than one episode.
@@ -195,9 +195,9 @@ def sample_trajectories(
 
 
 def _choose(probability: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """Index drawn from each row of ``probability`` [B, K] by inversion of ``uniform`` [B]."""
+    """An index from each row of ``probability`` [B, K], by inversion of ``uniform`` [B]."""
     cumulative = np.cumsum(probability, 1)
-    # Scaled by the total, so that rounding cannot push a draw past the last possible index.
+    # Scaled by the total, so that rounding cannot move a draw past the last possible index.
     passed = (cumulative <= uniform[:, None] * cumulative[:, -1:]).sum(1)
     return passed.clip(max=probability.shape[1] - 1)
 
@@ -205,8 +205,8 @@ def _choose(probability: np.ndarray, uniform: np.ndarray) -> np.ndarray:
 class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
     """The gridworld as an environment; see the module for cells, actions, slips and reward.
 
-    With ``goal="terminal"`` reaching the goal ends the episode; with ``absorbing`` the agent
-    stays there and is paid 0. There is no time limit here.
+    With ``goal="terminal"`` the goal ends the episode; with ``absorbing`` the agent stays there at
+    reward 0. The environment itself has no time limit.
 
     Args:
         size, path_group, blocked, goal, p_slip: as :func:`gridworld`.
@@ -239,7 +239,7 @@ class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Go to the bottom left; observation [2] float32."""
+        """Start at the bottom left; returns the observation [2] float32."""
         super().reset(seed=seed, options=options)
         self._state = int(self.mdp.start.argmax())
         return self._observations[self._state].copy(), {}
