@@ -119,7 +119,7 @@ def run(job: Job) -> None:
     import torch
 
     from irlcli.data import tensors
-    from irlcli.data.demonstrations import write_table
+    from irlcli.data.parquet import write_table
     from irlcli.envs.gridworld import tasks
 
     torch.set_num_threads(1)
