@@ -1,7 +1,7 @@
 """Where the time of adversarial IRL goes, against stepping the bare environment.
 
-Everything is measured in this one process and in its CPU seconds, alternating bare stepping and
-training rounds, so that other load and a change of the machine's speed meet both alike. Run by
+Everything is measured in this process and in its CPU seconds. Bare stepping and training rounds
+alternate, so that other load and changes of the machine's speed affect both alike. Run by
 ``make bench``.
 """
 
@@ -12,17 +12,18 @@ import resource
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from functools import partial
 
 import gymnasium
 import numpy as np
 import torch
 
 from irlcli.configs import load_config
-from irlcli.data.demonstrations import Demonstrations
+from irlcli.envs.registry import environment
 from irlcli.interventions import parse_settings
-from irlcli.learners.adversary import Adversary
-from irlcli.rl import ppo as rl
+from irlcli.learners.airl import AIRL
+from irlcli.rl.ppo import PPOTrainer
+from irlcli.rl.rollout import roll_out
+from irlcli.rl.worlds import action_space, make_worlds
 
 INTERVENTIONS = {
     "lunar-lander": "engine-power=1x,1.25x",
@@ -42,28 +43,32 @@ def main() -> None:
     config = load_config(arguments.env, arguments.profile).airl
     settings = parse_settings(arguments.env, arguments.intervention or INTERVENTIONS[arguments.env])
 
-    bare = rl.make_worlds(arguments.env, settings, config.ppo.n_envs)
-    worlds = rl.make_worlds(arguments.env, settings, config.ppo.n_envs)
+    bare = make_worlds(arguments.env, settings, config.ppo.n_envs)
+    worlds = make_worlds(arguments.env, settings, config.ppo.n_envs)
     # Random demonstrations cost as much to learn from as an expert's.
-    demos = Demonstrations(
-        arguments.env,
-        {str(s): tuple(rl.roll_out(arguments.env, s, "random", 10, 0, "bench")) for s in settings},
-        {},
+    demos = [roll_out(arguments.env, s, "random", 10, 0, "bench") for s in settings]
+    trainer = PPOTrainer(worlds, config.ppo, config.total_steps, 0, "bench")
+    learner = AIRL(
+        demos,
+        config,
+        worlds=len(worlds),
+        horizon=environment(arguments.env).max_episode_steps,
+        observation_size=worlds.observation_space.shape[0],
+        actions=action_space(worlds.action_space),
+        seed=0,
     )
-    trainer = rl.PPOTrainer(worlds, config.ppo, config.total_steps, 0, "bench")
-    adversary = Adversary(demos, config, worlds, 0)
 
     seconds: dict[str, float] = defaultdict(float)
     worlds.step = _timed(worlds.step, seconds, "environment")
     worlds.reset = _timed(worlds.reset, seconds, "environment")
     trainer.model.collect_rollouts = _timed(trainer.model.collect_rollouts, seconds, "rollout")
     trainer.model.train = _timed(trainer.model.train, seconds, "PPO update")
-    reward = _timed(partial(adversary.reward, policy=trainer.policy), seconds, "rewards")
+    learner.rewards = _timed(learner.rewards, seconds, "rewards")
 
     steps = 0
     for index in range(-1, arguments.rounds):
         if index == 0:
-            # The round before it warmed caches and lazy imports up.
+            # The first round warmed up caches and lazy imports.
             seconds.clear()
             steps = 0
         count = trainer.steps_per_round
@@ -71,9 +76,9 @@ def main() -> None:
         _step_bare(bare, count, index + 1)
         seconds["bare stepping"] += time.process_time() - started
         started = time.process_time()
-        rollouts = trainer.train_round(index + 1, reward)
+        rollouts = trainer.train_round(index + 1, learner)
         policy_done = time.process_time()
-        adversary.train_round(index + 1, rollouts, trainer.policy)
+        learner.update(index + 1, rollouts, trainer.policy)
         ended = time.process_time()
         seconds["discriminator"] += ended - policy_done
         seconds["AIRL in all"] += ended - started

@@ -1,11 +1,11 @@
-"""What lies beyond the bounds of the actions, and what log pi(a|s) makes of it.
+"""How many demonstrated actions lie beyond the bounds, and their log pi(a|s).
 
     python -m benchmarks.clipped_actions DEMONSTRATIONS POLICY
 
-Of each setting: the share of the demonstrations' action components beyond the bounds, how large
+For each setting: the share of the demonstrations' action components beyond the bounds, how large
 they are, and the mean log pi of the demonstrations and of the policy's own actions in the same
-states, by ``airl.actions`` sampled and executed. Both are artefacts, in the store that IRL_STORE
-names, ``runs`` by default.
+states, with ``airl.actions`` sampled and executed. Both arguments are artefacts of the store in
+IRL_STORE (``runs`` by default).
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from irlcli.configs import AIRLConfig
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.data.tensors import load_policy_file
-from irlcli.envs import registration as envs
+from irlcli.envs.registration import make
 from irlcli.envs.registry import environment
 from irlcli.errors import IrlError
 from irlcli.experiments import references
 from irlcli.interventions import parse_setting
-from irlcli.learners.actions import SeenActions
+from irlcli.learners.actions import ActionView
+from irlcli.rl.worlds import action_space
 from irlcli.store import Store
 from irlcli.trajectories import transitions
 
@@ -41,13 +41,13 @@ def main(demonstrations: str, learned: str) -> None:
     )
     for setting, episodes in demos.trajectories.items():
         data = transitions(episodes, environment(demos.env).max_episode_steps)
-        space = envs.make(demos.env, parse_setting(demos.env, setting)).action_space
+        space = make(demos.env, parse_setting(demos.env, setting)).action_space
         size = np.abs(data.actions) / space.high
         own = replace(data, actions=policy.act(data.observations))
         for kind in ("sampled", "executed"):
-            seen = SeenActions(AIRLConfig(actions=kind), space)
+            view = ActionView(kind, action_space(space))
             theirs, its = (
-                float(seen.log_prob(policy, seen.of(d)).double().mean()) for d in (data, own)
+                float(view.log_prob(policy, view.of(d)).double().mean()) for d in (data, own)
             )
             print(
                 f"{setting:<24}  {(size > 1).mean():>5.0%}  {np.quantile(size, 0.99):>10.1f}  "

@@ -1,6 +1,6 @@
 """Two AIRL jobs side by side against one: does a second core give a second job's worth of work?
 
-One and two jobs alternate in blocks within this run, so that other load meets both alike.
+One and two jobs alternate in blocks within this run, so that other load affects both alike.
 Run by ``make bench``.
 """
 

@@ -2,12 +2,12 @@
 
     python -m benchmarks.workers [ROUNDS]
 
-Rounds with one and with two workers alternate, so whatever else the machine does falls on both;
-*by the clock* is the median ratio of neighbouring rounds. It needs two idle cores. *By CPU time*
-needs none: every round takes the same steps, and of each step the least CPU time over the rounds,
-the parent's and each worker's, comes nearest to an idle machine's. The parent sleeps while workers
-step, so a step lasts as long as the parent and its slowest worker together. Beside heavy load even
-that is too high, since waking finds the caches cold.
+Rounds with one and with two workers alternate, so that other load affects both alike. *By the
+clock* is the median ratio of neighbouring rounds; it needs two idle cores. *By CPU time* does not:
+every round takes the same steps, and the least CPU time of each step over the rounds, for the parent
+and for each worker, is closest to an idle machine's. The parent sleeps while workers step, so a step
+takes as long as the parent and its slowest worker together. Under heavy load even that is too high,
+because caches are cold after waking.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from irlcli.envs import registration as envs
+from irlcli.envs.registration import make
 from irlcli.envs.workers import WorkerWorlds
 from irlcli.interventions import parse_setting
 
@@ -50,7 +50,7 @@ def times(worlds: WorkerWorlds) -> np.ndarray:
 
 def main(rounds: int) -> None:
     """Print a line for each number of workers, and the ratios."""
-    factories = [partial(envs.make, "ant", parse_setting("ant", "default"))] * WORLDS
+    factories = [partial(make, "ant", parse_setting("ant", "default"))] * WORLDS
     teams = [WorkerWorlds(factories, STEPS + 1, workers) for workers in (1, 2)]
     rows = [[times(team) for team in teams] for _ in range(rounds)]
     measured = [np.array(samples) for samples in zip(*rows, strict=True)]
