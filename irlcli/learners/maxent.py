@@ -304,7 +304,7 @@ class MaxEnt:
         self.networks.load_state_dict(state["networks"])
         self._optimizer.load_state_dict(state["optimizer"])
         steps, *fields = (field.numpy() for field in state["records"])
-        self.records = list(map(Record, steps.tolist(), *fields, strict=True))
+        self.records = [Record(*values) for values in zip(steps.tolist(), *fields, strict=True)]
         self.iterations = int(state["iterations"])
 
 
