@@ -141,7 +141,7 @@ def test_experts_are_carried_over_to_every_setting(report, irl, table_store):
     directory = Path(report("table1", table_store, *ROW).out.strip())
     points = pd.read_csv(directory / "seeds.csv")
     points = points[points["row"] == "lunar-lander engine-power"]
-    carried = points[points["agent"] == "carried"]
+    carried = points[points["agent"] == "reused"]
     trained = ["engine-power=1.25x", "engine-power=1x"]
     unseen = carried[carried["measure"] == "ood"]
     assert sorted(unseen["expert_of"]) == trained
@@ -155,7 +155,7 @@ def test_experts_are_carried_over_to_every_setting(report, irl, table_store):
         assert own == place and inside[own, own] == value
     cells = pd.read_csv(directory / "table1.csv").set_index(["row", "agent", "measure"])
     for measure, values in (("ood", unseen["true_return"]), ("id", inside)):
-        mean = cells.loc[("lunar-lander engine-power", "carried", measure), "mean"]
+        mean = cells.loc[("lunar-lander engine-power", "reused", measure), "mean"]
         assert mean == pytest.approx(values.mean(), rel=1e-5)
     # The command says whose expert it is where that is not the setting's own.
     where = [*ROW, "--intervention", "engine-power", "--trained-in", "engine-power=1x"]

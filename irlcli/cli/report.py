@@ -158,7 +158,7 @@ def _print_report(report: dict[str, Any]) -> None:
         if table["title"] != "Every cell":
             out.print_table(table["columns"], table["rows"], table["title"], stderr=True)
             out.print_note(f"{table['note']}\n" if table["note"] else "")
-    for note in report["notes"]:
+    for caveat in report["caveats"]:
         out.print_note(f"- {note}")
 
 

@@ -19,12 +19,12 @@ from irlcli.stages import (
     choose_penalty,
     collect_experts,
     evaluate,
-    results,
+    report,
+    report_experts,
     train_airl,
     train_expert,
     transfer,
 )
-from irlcli.stages import experts as stages_experts
 from irlcli.stages.base import From, Request, Source
 from irlcli.store import Artefact, Resolved, digest, read_json
 
@@ -67,7 +67,7 @@ EXPERIMENTS = {
 class _Planned(NamedTuple):
     """A wanted evaluation: its cell, the request, and the stages whose learning curves belong."""
 
-    cell: results.Cell
+    cell: report.Cell
     request: Request
     curves: Mapping[str, Request]
 
@@ -149,7 +149,7 @@ def request(
             "the runs, `irl ls` lists what there is",
         )
     facts, libraries = _facts(runs.values())
-    parameters = results.Parameters(
+    parameters = report.Parameters(
         kind=kind,
         title=experiment.title,
         command=command,
@@ -162,7 +162,7 @@ def request(
         libraries=libraries,
         others=tuple(_others(runner.store.artefacts(), expected, set(runs))),
     )
-    return results.request(parameters, sources)
+    return report.request(parameters, sources)
 
 
 def experts(
@@ -185,6 +185,8 @@ def experts(
             bars[env] = config.expert.bar
         for knob, listed in config.interventions.items():
             for measure, values in (("id", listed.id), ("ood", listed.ood)):
+                if not values:
+                    continue
                 places = parse_settings(env, f"{knob}={','.join(values)}")
                 wanted = [
                     (agent, "", evaluate.request(env, places, config.evaluation, agent=agent))
@@ -201,7 +203,7 @@ def experts(
                     wanted.append(("expert", str(place), measured))
                 for agent, place, measured in wanted:
                     steps = plan(measured)
-                    cell = results.Cell(f"{env} {knob}", agent, measure, place=place)
+                    cell = report.Cell(f"{env} {knob}", agent, measure, place=place)
                     cells.append(_placed(cell, steps))
                     for step in steps:
                         if step.artefact is not None:
@@ -215,10 +217,10 @@ def experts(
             "`make experts` makes them; --profile and --set must be those of the runs",
         )
     facts, _ = _facts(runs.values())
-    parameters = stages_experts.Parameters(
+    parameters = report_experts.Parameters(
         command=command, steps=budgets, bars=bars, cells=tuple(cells), runs=facts
     )
-    return stages_experts.request(parameters, sources)
+    return report_experts.request(parameters, sources)
 
 
 class _Learner(NamedTuple):
@@ -261,7 +263,7 @@ def _check(values: Sequence[Any], what: str, known: Sequence[Any] | None = None)
 
 def _row(
     env, knob, measures, settings, methods, seeds, learner
-) -> tuple[results.Row, list[_Planned]]:
+) -> tuple[report.Row, list[_Planned]]:
     """One row of the table and everything that it stands on."""
     config = settings(env, None)
     listed = config.interventions[knob]
@@ -291,7 +293,7 @@ def _row(
 
     planned = [
         _Planned(
-            results.Cell(name, agent, "ood", place=str(unseen[0])),
+            report.Cell(name, agent, "ood", place=str(unseen[0])),
             measured(unseen, None, agent),
             {},
         )
@@ -299,7 +301,7 @@ def _row(
     ]
     planned.append(
         _Planned(
-            results.Cell(name, "expert", "ood", place=str(unseen[0])),
+            report.Cell(name, "expert", "ood", place=str(unseen[0])),
             measured(unseen, expert(unseen[0])),
             {},
         )
@@ -307,11 +309,11 @@ def _row(
     for e in trained:
         wanted = (
             ("expert", "id", [e]),
-            ("carried", "ood", unseen),
-            ("carried", "id", trained),
+            ("reused", "ood", unseen),
+            ("reused", "id", trained),
         )
         planned += [
-            _Planned(results.Cell(name, agent, m, place=str(e)), measured(places, expert(e)), {})
+            _Planned(report.Cell(name, agent, m, place=str(e)), measured(places, expert(e)), {})
             for agent, m, places in wanted
         ]
     chosen = {}
@@ -328,7 +330,7 @@ def _row(
             }
             for measure in measures:
                 places, policy, curves = where[measure]
-                cell = results.Cell(name, method, measure, seed)
+                cell = report.Cell(name, method, measure, seed)
                 wanted = measured(places, policy)
                 if measure == "transfer":
                     # One without the reward has the same true returns: better than none.
@@ -337,23 +339,23 @@ def _row(
                         wanted = paid
                 planned.append(_Planned(cell, wanted, curves))
             if "transfer" in measures:
-                cell = results.Cell(name, method, "expert by reward", seed, str(unseen[0]))
+                cell = report.Cell(name, method, "expert by reward", seed, str(unseen[0]))
                 paid = measured(unseen, expert(unseen[0]), reward=airl)
                 planned.append(_Planned(cell, paid, {}))
     tree = msgspec.to_builtins(config)
-    row = results.Row(
+    row = report.Row(
         env=env,
         knob=knob,
         trained=tuple(str(e) for e in trained),
         unseen=str(unseen[0]),
         demonstrations=demos.parameters.episodes,
-        settings={stage: tree[stage] for stage in _STAGES},
+        config={stage: tree[stage] for stage in _STAGES},
         chosen=chosen,
     )
     return row, planned
 
 
-def _placed(cell: results.Cell, steps: Sequence[Step]) -> results.Cell:
+def _placed(cell: report.Cell, steps: Sequence[Step]) -> report.Cell:
     """The cell with its run, or with what it waits for."""
     artefact = steps[-1].artefact
     if artefact is not None:
@@ -368,7 +370,7 @@ def _output(artefact: Artefact, name: str) -> Source:
     return source_of(Resolved(artefact, artefact.directory / name))
 
 
-def _facts(artefacts: Iterable[Artefact]) -> tuple[dict[str, results.Run], dict[str, Any]]:
+def _facts(artefacts: Iterable[Artefact]) -> tuple[dict[str, report.Run], dict[str, Any]]:
     """What provenance says of each artefact, and the sets of library versions that occur."""
     runs, libraries = {}, {}
     for artefact in sorted(artefacts, key=lambda a: a.id):
@@ -378,7 +380,7 @@ def _facts(artefacts: Iterable[Artefact]) -> tuple[dict[str, results.Run], dict[
         name = digest(versions)[:8]
         libraries[name] = versions
         record = artefact.manifest.record
-        runs[artefact.id] = results.Run(
+        runs[artefact.id] = report.Run(
             stage=record.stage,
             about=_subject_text(record.stage, record.parameters),
             code=tuple(dict.fromkeys(_code(state) for state in said.get("attempts") or [git])),
@@ -390,8 +392,8 @@ def _facts(artefacts: Iterable[Artefact]) -> tuple[dict[str, results.Run], dict[
     return runs, libraries
 
 
-def _code(said: Mapping[str, Any]) -> results.Code:
-    return results.Code(commit=said.get("commit"), dirty=said.get("dirty"))
+def _code(said: Mapping[str, Any]) -> report.Code:
+    return report.Code(commit=said.get("commit"), dirty=said.get("dirty"))
 
 
 def _ids(inputs: Mapping[str, str]) -> Iterator[str]:
@@ -447,7 +449,7 @@ def _others(
     artefacts: Iterable[Artefact],
     expected: Mapping[_Subject, tuple[int, dict[str, Any]]],
     used: set[str],
-) -> list[results.Others]:
+) -> list[report.Others]:
     """Runs about the same as a cell's that were made otherwise, counted by how they differ."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for artefact in artefacts:
@@ -459,7 +461,7 @@ def _others(
         about = _subject_text(record.stage, record.parameters)
         groups.setdefault((record.stage, about, why), []).append(artefact.id)
     return [
-        results.Others(stage=stage, about=about, why=why, ids=tuple(ids))
+        report.Others(stage=stage, about=about, why=why, ids=tuple(ids))
         for (stage, about, why), ids in sorted(groups.items())
     ]
 

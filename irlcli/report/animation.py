@@ -1,18 +1,18 @@
-"""Pictures of a policy at work: several settings side by side, as an animated GIF."""
+"""Animated GIFs of a policy acting in several settings side by side."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import gymnasium
 import numpy as np
-import torch
 from PIL import Image, ImageDraw, ImageOps
 
 from irlcli.envs import registration as envs
 from irlcli.envs.registry import environment
 from irlcli.interventions import Setting
-from irlcli.rl.ppo import Policy, require_observations
+from irlcli.rl.policy import Policy, require_observations
 
 PANEL = (320, 240)
 _CAPTION = 16
@@ -22,15 +22,21 @@ _FRAMES_PER_SECOND = 20
 def write_gif(
     path: Path, policy: Policy, env: str, settings: Sequence[Setting], steps: int, seed: int
 ) -> None:
-    """Play one episode of ``policy`` in each setting, all from ``seed``, at true speed.
+    """Play one episode of ``policy`` in each setting, all from ``seed``, in real time.
 
-    Actions are the policy's most likely ones. A panel whose episode is over stands still.
+    Actions are the most likely ones. When an episode ends, its panel keeps the last frame.
+
+    Args:
+        path: the GIF to write.
+        env: name of the environment.
+        settings: a panel each, left to right.
+        steps: at most this many steps per episode; at most the time limit.
+        seed: of the episodes' starts.
 
     Raises:
-        UsageError: a setting's observations are not those the policy was trained on.
+        UsageError: a setting's observations differ from those the policy was trained on.
         OSError: ``path`` cannot be written.
     """
-    torch.set_num_threads(1)
     worlds = [envs.make(env, setting, render_mode="rgb_array") for setting in settings]
     for world, setting in zip(worlds, settings, strict=True):
         require_observations(policy, world.observation_space, f"{env} {setting}")
@@ -51,13 +57,15 @@ def write_gif(
         frames.append(_beside(last))
     for world in worlds:
         world.close()
-    # A GIF counts time in hundredths of a second.
+    # GIF durations have a resolution of 10 ms.
     duration = round(100 * stride / rate) * 10
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
 
 
-def _panels(world, policy, caption, limit, stride, seed) -> Iterator[Image.Image]:
-    """Every ``stride``-th step of one episode, drawn."""
+def _panels(
+    world: gymnasium.Env, policy: Policy, caption: str, limit: int, stride: int, seed: int
+) -> Iterator[Image.Image]:
+    """A panel for every ``stride``-th step of one episode, and one for its end."""
     observation, _ = world.reset(seed=seed)
     total = 0.0
     for step in range(limit):
@@ -72,7 +80,7 @@ def _panels(world, policy, caption, limit, stride, seed) -> Iterator[Image.Image
 
 
 def _panel(picture: np.ndarray, caption: str) -> Image.Image:
-    """``picture`` [H, W, 3] uint8 at the panel's size, under its caption."""
+    """``picture`` [H, W, 3] uint8, resized to a panel, with a caption above it."""
     panel = Image.new("RGB", (PANEL[0], PANEL[1] + _CAPTION), "white")
     panel.paste(ImageOps.pad(Image.fromarray(picture), PANEL), (0, _CAPTION))
     ImageDraw.Draw(panel).text((4, 2), caption, fill="black")
@@ -80,7 +88,7 @@ def _panel(picture: np.ndarray, caption: str) -> Image.Image:
 
 
 def _beside(panels: Sequence[Image.Image]) -> Image.Image:
-    """One picture of all panels, left to right."""
+    """All panels in one image, left to right."""
     row = Image.new("RGB", (PANEL[0] * len(panels), PANEL[1] + _CAPTION))
     for index, panel in enumerate(panels):
         row.paste(panel, (PANEL[0] * index, 0))

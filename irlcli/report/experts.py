@@ -13,30 +13,36 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from irlcli.report.results import commits, duration
-from irlcli.report.tables import markdown_table
+from irlcli.report.lineage import commits, duration
+from irlcli.report.parameters import Cell, Run
+from irlcli.report.tables import Table, markdown_table
 
 _TITLE = "Experts: true return in their own settings"
 _NOTE = (
-    "Mean true return of whole episodes, and the mean progress in the direction of the goal where "
-    "the environment has one: a robot that stands still is paid for being alive. Random and idle "
-    "are agents that learn nothing. Minutes are one process's on a machine that others shared."
+    "Mean true return of whole episodes ± standard deviation over episodes. Progress: the part of "
+    "the return earned by moving toward the goal, where the environment reports it; a robot that "
+    "stands still is rewarded for being alive. Random and idle agents learn nothing. Time: one "
+    "process on a machine shared with other runs."
 )
+_USES = {"id": "trained in", "ood": "held out"}
 
 
-def table(
-    cells: Sequence[Any],
-    runs: Mapping[str, Any],
+def summarise(
+    cells: Sequence[Cell],
+    runs: Mapping[str, Run],
     steps: Mapping[str, int],
     summaries: Mapping[tuple[str, str, str], Any],
 ) -> pd.DataFrame:
-    """A row per setting: what expert, idle and random agent earn there, and the expert's training.
+    """A row per setting: the returns of expert, idle and random agent, and the expert's training.
+
+    ``stands`` is ``done``, or what a missing evaluation waits for. Times are in seconds.
 
     Args:
-        cells: those of ``stages.experts.Parameters``.
-        runs: facts by id; an evaluation's only input is its policy.
+        cells: the wanted evaluations; rows are ``ENV KNOB``.
+        runs: provenance by id; an evaluation's only input is its policy.
         steps: an expert's budget, by environment.
-        summaries: evaluated settings by (agent, environment, setting); those missing are not there.
+        summaries: the existing evaluations by (agent, environment, setting), each a
+            :class:`irlcli.data.descriptions.Returns`.
     """
     rows = []
     for cell in cells:
@@ -46,33 +52,33 @@ def table(
         expert, idle, random = (
             summaries.get((agent, env, cell.place)) for agent in ("expert", "idle", "random")
         )
-        learned = [runs[i] for i in runs[cell.run].inputs if i in runs] if cell.run else []
-        row = {
-            "env": env,
-            "knob": knob,
-            "setting": cell.place,
-            "use": {"id": "trained in", "ood": "held out"}[cell.measure],
-            "true_return": _value(expert, "mean_return"),
-            "std_return": _value(expert, "std_return"),
-            "progress": _value(expert, "mean_progress"),
-            "length": _value(expert, "mean_length"),
-            "terminated": _value(expert, "terminated"),
-            "episodes": _value(expert, "episodes"),
-            "idle_return": _value(idle, "mean_return"),
-            "random_return": _value(random, "mean_return"),
-            "steps": steps[env],
-            "seconds": learned[0].seconds if learned else None,
-            "resumed": learned[0].resumed if learned else None,
-            "commit": ", ".join(commits(learned)) if learned else None,
-            "stands": "done" if cell.run else cell.why,
-        }
-        rows.append(row)
+        trained = [runs[i] for i in runs[cell.run].inputs if i in runs] if cell.run else []
+        rows.append(
+            {
+                "env": env,
+                "knob": knob,
+                "setting": cell.place,
+                "use": _USES[cell.measure],
+                "true_return": _value(expert, "mean_return"),
+                "std_return": _value(expert, "std_return"),
+                "progress": _value(expert, "mean_progress"),
+                "length": _value(expert, "mean_length"),
+                "terminated": _value(expert, "terminated"),
+                "episodes": _value(expert, "episodes"),
+                "idle_return": _value(idle, "mean_return"),
+                "random_return": _value(random, "mean_return"),
+                "steps": steps[env],
+                "seconds": trained[0].seconds if trained else None,
+                "resumed": trained[0].resumed if trained else None,
+                "commit": ", ".join(commits(trained)) if trained else None,
+                "stands": "done" if cell.run else cell.why,
+            }
+        )
     return pd.DataFrame(rows)
 
 
-def text_table(found: pd.DataFrame) -> dict[str, Any]:
-    """``table`` for people: title, note, columns and rows of text."""
-    columns = ["setting", "use", "expert", "progress", "idle", "random", "steps", "took", "commit"]
+def text_table(found: pd.DataFrame) -> Table:
+    """:func:`summarise` for people."""
     rows = []
     for row in found.itertuples():
         value = f"{_text(row.true_return)} ± {_text(row.std_return)}"
@@ -90,11 +96,12 @@ def text_table(found: pd.DataFrame) -> dict[str, Any]:
                 row.commit if isinstance(row.commit, str) else "-",
             ]
         )
-    return {"title": _TITLE, "note": _NOTE, "columns": columns, "rows": rows}
+    columns = ["setting", "use", "expert", "progress", "idle", "random", "steps", "time", "commit"]
+    return Table(_TITLE, _NOTE, columns, rows)
 
 
-def notes(cells: Sequence[Any], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
-    """What is missing, and who earns less than an expert must."""
+def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
+    """Experts that do not reach their environment's bar, and missing ones."""
     experts = [cell for cell in cells if cell.agent == "expert"]
     missing = [f"{cell.row.split()[0]} {cell.place}" for cell in experts if not cell.run]
     low = [
@@ -102,34 +109,36 @@ def notes(cells: Sequence[Any], found: pd.DataFrame, bars: Mapping[str, float]) 
         for row in found.itertuples()
         if row.env in bars and row.true_return < bars[row.env]
     ]
-    said = [f"Below their bar, no experts yet: {', '.join(low)}."] if low else []
+    sentences = [f"Below their bar, so not yet experts: {', '.join(low)}."] if low else []
     if missing:
-        said.append(f"Missing: {len(missing)} of {len(experts)} experts: {', '.join(missing)}.")
-    return said
+        sentences.append(
+            f"Missing: {len(missing)} of {len(experts)} experts: {', '.join(missing)}."
+        )
+    return sentences
 
 
-def markdown(command: str, text: Mapping[str, Any], said: Sequence[str]) -> str:
-    """The page."""
+def markdown(command: str, table: Table, caveats: Sequence[str]) -> str:
+    """The report as one page."""
     return "\n".join(
         [
-            f"# {text['title']}\n",
+            f"# {table.title}\n",
             f"`{command}`\n",
-            *(f"- {note}\n" for note in said),
-            markdown_table(text["columns"], text["rows"]),
-            f"± standard deviation over episodes. {text['note']}\n",
+            *(f"- {caveat}\n" for caveat in caveats),
+            markdown_table(table.columns, table.rows),
+            f"{table.note}\n",
             "![learning curves](experts.png)\n",
-            "Learning curves: episodes of a policy that explores; held-out settings are dashed.\n",
+            "Learning curves: episodes of the exploring policy; held-out settings are dashed.\n",
             "`experts.csv` has a row per setting.\n",
         ]
     )
 
 
-def draw(directory: Path, cells: Sequence[Any], learning: Mapping[str, pd.DataFrame]) -> None:
+def draw(directory: Path, cells: Sequence[Cell], learning: Mapping[str, pd.DataFrame]) -> None:
     """Write ``experts.png`` and ``experts.pdf``: return and progress of every expert over steps.
 
     ``learning`` maps ``ENV SETTING learning`` to an expert's metrics.
     """
-    curves: dict[str, list[tuple[Any, pd.DataFrame]]] = {}
+    curves: dict[str, list[tuple[Cell, pd.DataFrame]]] = {}
     for cell in cells:
         metrics = learning.get(f"{cell.row.split()[0]} {cell.place} learning")
         if cell.agent == "expert" and metrics is not None:
@@ -148,7 +157,9 @@ def draw(directory: Path, cells: Sequence[Any], learning: Mapping[str, pd.DataFr
         plt.close(figure)
 
 
-def _panel(axis, title: str, name: str, experts: Sequence[tuple[Any, pd.DataFrame]]) -> None:
+def _panel(
+    axis: plt.Axes, title: str, name: str, experts: Sequence[tuple[Cell, pd.DataFrame]]
+) -> None:
     if not any(metrics[name].notna().any() for _, metrics in experts):
         axis.set_axis_off()
         return

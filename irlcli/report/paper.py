@@ -1,6 +1,7 @@
-"""The paper's numbers: "Learning Invariant Reward Functions through Trajectory Interventions",
-2021, Table 1. Mean and standard deviation over random seeds; n = 5 is not printed but follows:
-with it Student's test gives the printed p-values back (the first is printed .0458 for .0486).
+"""Table 1 of "Learning Invariant Reward Functions through Trajectory Interventions" (2021).
+
+Means and standard deviations over random seeds. The paper does not print n. With n = 5, Student's
+test reproduces its p-values, except that the first is printed as .0458 instead of .0486.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""True returns of evaluations, side by side: who acted, where, and how it varies over seeds."""
+"""True returns of evaluations, side by side: which agent, in which setting, over which seeds."""
 
 from __future__ import annotations
 
@@ -10,23 +10,33 @@ from typing import Any
 from irlcli.data.descriptions import Evaluation, Subject
 from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
+from irlcli.report.agents import title
 
 _ORDER = ("expert", "student", "transfer", "random", "idle")
-_WHAT = {"student": "zero-shot", "transfer": "transfer"}
+_HINT = "a row is a sample over seeds: report runs that differ in anything else separately"
 
 
 @dataclass(frozen=True)
 class Row:
-    """One agent in one setting; the sample of the statistics is the seed, not the episode."""
+    """One agent in one setting, a sample over seeds.
+
+    Attributes:
+        returns: mean true return of each seed.
+        episodes: per seed.
+        progress: mean over seeds; None if the environment reports none.
+        learned: mean learned return over seeds; None if no reward was given.
+        policies: number of distinct policies. One policy under several rewards is no sample of
+            true returns.
+    """
 
     agent: str
     env: str
     setting: str
-    returns: tuple[float, ...]  # mean true return of each seed
-    episodes: int  # per seed
-    progress: float | None = None  # mean over seeds; None if the environment reports none
-    learned: float | None = None  # mean over seeds of what a learned reward pays per episode
-    policies: int = 1  # one policy under several rewards is no sample of true returns
+    returns: tuple[float, ...]
+    episodes: int
+    progress: float | None = None
+    learned: float | None = None
+    policies: int = 1
 
     @property
     def mean(self) -> float:
@@ -35,25 +45,24 @@ class Row:
 
     @property
     def deviation(self) -> float | None:
-        """Standard deviation over seeds; None for one policy."""
+        """Standard deviation over seeds (n - 1); None for one policy."""
         return statistics.stdev(self.returns) if self.policies > 1 else None
 
 
 def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> list[Row]:
-    """Rows of evaluations, one per agent, method and setting: experts first, random and idle last.
+    """A row per agent, method and setting: experts first, random and idle last.
 
-    An agent that was measured by another reward than its own is a row for each method of that, its
-    seeds pairs of the policy's and the reward's.
+    An agent that was scored by another reward than its own has a row for each method of such
+    rewards. Its seeds are then pairs: the policy's and the reward's.
 
     Args:
-        evaluations: ``summary.json``, the parameters behind it that no seed may change, and
-            whether a reward that it measured by is the policy's own.
+        evaluations: ``summary.json``, the parameters behind it that must not differ between seeds,
+            and whether the reward that scored the policy is the policy's own.
 
     Raises:
-        UsageError: one seed of the reward learning twice in a row, or seeds that differ in one of
-            those parameters.
+        UsageError: a row has the same seed twice, or seeds that differ in one of those parameters.
     """
-    made: dict[tuple[int, str, str, str], Mapping[str, Any]] = {}
+    parameters_of: dict[tuple[int, str, str, str], Mapping[str, Any]] = {}
     groups: dict[tuple[int, str, str, str], dict[tuple, tuple]] = {}
     for summary, parameters, own in evaluations:
         policy, reward = summary.policy, summary.reward
@@ -62,23 +71,21 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
             agent = agent_name(policy, item.setting)
             seeds = [policy.seed if policy.reward_seed is None else policy.reward_seed]
             if reward is not None and not own:
-                agent += f" on airl-{reward.method}'s reward"
+                agent += f" under {title(reward.method)}'s reward"
                 seeds.append(reward.seed)
             key = (order, agent, policy.env, item.setting)
-            values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
             if tuple(seeds) in groups.get(key, {}):
-                raise UsageError(
-                    f"{agent} in {item.setting} has seed {' under the reward of seed '.join(map(str, seeds))} twice",
-                    "a row's sample is the seed: report runs that differ in anything else apart",
-                )
-            first = made.setdefault(key, parameters)
+                which = " under the reward of seed ".join(map(str, seeds))
+                raise UsageError(f"{agent} in {item.setting} has seed {which} twice", _HINT)
+            first = parameters_of.setdefault(key, parameters)
             for name in sorted(first | parameters):
                 if first.get(name) != parameters.get(name):
                     raise UsageError(
                         f"runs of {agent} in {item.setting} differ in {name}: "
                         f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
-                        "a row's sample is the seed: report runs that differ in anything else apart",
+                        _HINT,
                     )
+            values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
             groups.setdefault(key, {})[tuple(seeds)] = values
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):
@@ -90,15 +97,20 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
 
 
 def agent_name(policy: Subject, setting: str) -> str:
-    """``airl-irm transfer``, ``airl-erm zero-shot``, ``random``, ``idle``, or ``expert``.
+    """What ``policy`` is called in ``setting``.
 
-    One that was trained in another setting than ``setting`` is ``expert of bounce=0.1``, a
-    student where its demonstrations are from ``airl-erm in distribution``.
+    ``expert``, ``expert of bounce=0.1`` where that is another setting, ``random``, ``idle``,
+    ``AIRL-IRM retrained policy``, ``AIRL-IRM student, zero-shot``, or ``AIRL-IRM student, in
+    distribution`` where its demonstrations cover the setting.
     """
     agent = policy.agent
     if agent == "expert" and policy.settings and setting not in policy.settings:
         return f"expert of {', '.join(policy.settings)}"
-    shown = (parse_setting(policy.env, text) for text in policy.settings)
-    if agent == "student" and any(covers(s, parse_setting(policy.env, setting)) for s in shown):
-        return f"airl-{policy.method} in distribution"
-    return f"airl-{policy.method} {_WHAT[agent]}" if agent in _WHAT else agent
+    method = title(policy.method or "")
+    if agent == "transfer":
+        return f"{method} retrained policy"
+    if agent == "student":
+        demonstrated = (parse_setting(policy.env, text) for text in policy.settings)
+        seen = any(covers(s, parse_setting(policy.env, setting)) for s in demonstrated)
+        return f"{method} student, {'in distribution' if seen else 'zero-shot'}"
+    return agent

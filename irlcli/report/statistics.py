@@ -1,7 +1,7 @@
 """Statistics of a comparison between methods. The sample is the seed of the reward learning.
 
-Every function is pure: arrays in, numbers out. What cannot be said is None, with its reason in
-:attr:`Comparison.why`.
+Every function is pure: arrays in, numbers out. A number that is not defined is None;
+:attr:`Comparison.why` gives the reason.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Run = TypeVar("Run")
 
 @dataclass(frozen=True)
 class Sample:
-    """What one method's seeds say of it.
+    """Statistics of one method's seeds.
 
     Attributes:
         mean, iqm: mean and interquartile mean; None without a seed.
@@ -41,9 +41,9 @@ class Comparison:
     Attributes:
         difference: mean of x minus mean of y; None if either is empty.
         welch: two-sided p of Welch's test, the primary one.
-        student: two-sided p of the equal-variance test, the paper's.
+        student: two-sided p of Student's test with equal variances, the paper's.
         improvement: P(X > Y) + P(X = Y) / 2 over pairs of seeds.
-        why: why there is no p; empty if there is.
+        why: the reason for missing p-values; else empty.
     """
 
     difference: float | None
@@ -56,8 +56,8 @@ class Comparison:
 def bootstrap_interval(sample: np.ndarray, seed: int = 0) -> tuple[float, float]:
     """95 % percentile interval of the mean of ``sample`` [n].
 
-    Percentile and not BCa: the latter does not exist for a constant sample. Both are too narrow
-    with few seeds.
+    Percentile rather than BCa, which is undefined for a constant sample. Both are too narrow with
+    few seeds.
     """
     if np.ptp(sample) == 0:
         return float(sample[0]), float(sample[0])
@@ -74,9 +74,9 @@ def bootstrap_interval(sample: np.ndarray, seed: int = 0) -> tuple[float, float]
 def interquartile_mean(sample: np.ndarray) -> float:
     """Mean of the middle half of ``sample`` [n] (Agarwal et al. 2021).
 
-    Exactly half for any n: the values on the quartiles count in part, so that of five seeds the
-    middle three have weights 0.75, 1, 0.75. ``trim_mean`` alone, which the authors' rliable calls,
-    would trim a whole number of values; the two agree where n is a multiple of four.
+    Exactly half for any n: values at the quartiles count in part, so of five seeds the middle three
+    have weights 0.75, 1, 0.75. The authors' rliable calls ``trim_mean`` alone, which trims a whole
+    number of values; the two agree if n is a multiple of four.
     """
     return float(stats.trim_mean(np.repeat(sample, 4), 0.25))
 
@@ -88,7 +88,7 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def summarise(sample: Sequence[float]) -> Sample:
-    """The statistics of one method's seeds [n], n from 0 on."""
+    """The statistics of one method's seeds [n]; n may be 0."""
     values = np.asarray(sample, np.float64)
     if len(values) == 0:
         return Sample(0, None, None, None, None)
@@ -103,20 +103,31 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
     """``x`` [n] against ``y`` [m]."""
     a, b = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if not len(a) or not len(b):
-        return Comparison(None, None, None, None, "one of the two has no seed")
+        return Comparison(None, None, None, None, "one of the two methods has no seed")
     difference, improvement = float(a.mean() - b.mean()), probability_of_improvement(a, b)
     if min(len(a), len(b)) < 2:
-        why = "one seed has no variance: two of each are needed"
+        why = "one seed has no variance; each method needs two"
     elif not np.ptp(a) and not np.ptp(b):
-        why = "no seed differs from another: the variance is zero"
+        why = "all seeds are equal, so the variance is zero"
     else:
         welch, student = (float(stats.ttest_ind(a, b, equal_var=v).pvalue) for v in (False, True))
         return Comparison(difference, welch, student, improvement)
     return Comparison(difference, None, None, improvement, why)
 
 
+def paired_p(x: Sequence[float], y: Sequence[float]) -> float | None:
+    """Two-sided p of the paired t-test on ``x`` [n] and ``y`` [n], aligned by seed.
+
+    None below two pairs, or if all differences are equal.
+    """
+    differences = np.asarray(x, np.float64) - np.asarray(y, np.float64)
+    if len(differences) < 2 or not np.ptp(differences):
+        return None
+    return float(stats.ttest_rel(x, y).pvalue)
+
+
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's adjusted p-values. None stays None and does not count as a test."""
+    """Holm-adjusted p-values. None stays None and does not count as a test."""
     known = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     adjusted: list[float | None] = [None] * len(p_values)
     least = 0.0
@@ -127,9 +138,9 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def identical_runs(episodes: Mapping[Run, Sequence[float]]) -> list[tuple[Run, ...]]:
-    """Groups of runs whose returns of every episode are the same to the bit.
+    """Groups of runs whose returns are bitwise equal in every episode.
 
-    Such runs are one run, whatever their seeds or methods are called.
+    Such runs are one run, whatever their seeds or methods.
     """
     groups: dict[bytes, list[Run]] = {}
     for run, returns in episodes.items():

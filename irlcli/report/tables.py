@@ -1,8 +1,9 @@
-"""Tables of text as Markdown and LaTeX."""
+"""Tables of text, as Markdown and LaTeX."""
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-# A float that is longer than a page is cut off.
+# LaTeX cuts off a float that is longer than a page.
 _PAGE_ROWS = 40
 _LATEX = {
     "\\": r"\textbackslash{}",
@@ -23,6 +24,16 @@ _LATEX = {
 }
 
 
+class Table(NamedTuple):
+    """Text in columns. The first ``heads`` columns name the row."""
+
+    title: str
+    note: str
+    columns: list[str]
+    rows: list[list[str]]
+    heads: int = 1
+
+
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
@@ -32,7 +43,7 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str
 
 
 def latex_table(columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
-    """A LaTeX table for the package booktabs; if it may not fit a page, also for longtable."""
+    """A LaTeX table for booktabs. One that may not fit a page also needs longtable."""
     body = [columns, *rows]
     lines = [" & ".join(latex_text(cell) for cell in line) + r" \\" for line in body]
     rules = [r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
@@ -47,5 +58,5 @@ def latex_table(columns: Sequence[str], rows: Sequence[Sequence[str]], caption: 
 
 
 def latex_text(text: str) -> str:
-    """``text`` with what LaTeX would read as commands escaped."""
+    """``text`` with LaTeX's special characters escaped."""
     return "".join(_LATEX.get(c, c) for c in text)

@@ -111,13 +111,13 @@ def test_another_lambdas_reward_is_not_the_policys_own(irl, store_copy):
         assert f"\n{row['agent']}  " in done.err
         assert isinstance(row["mean_learned_return"], float)
     assert agents == {
-        "airl": "airl-irm transfer",
-        "other": "airl-irm transfer on airl-irm's reward",
+        "airl": "AIRL-IRM retrained policy",
+        "other": "AIRL-IRM retrained policy under AIRL-IRM's reward",
     }
     student = irl("evaluate", "--policy", "airl", "--ood", "1.5x", "--reward", "other", *common)
-    assert "airl-irm zero-shot on airl-irm's reward" in student.err
+    assert "AIRL-IRM student, zero-shot under AIRL-IRM's reward" in student.err
     own = irl("evaluate", "--policy", "airl", "--ood", "1.5x", "--reward", "airl", *common)
-    assert "airl-irm zero-shot  " in own.err
+    assert "AIRL-IRM student, zero-shot  " in own.err
     # Experts under two rewards that differ in lambda are no row.
     for seed, reward in enumerate(("airl", "other")):
         named = ["--ood", "1.5x", "--reward", reward, "--name", f"expert-{seed}"]
@@ -141,7 +141,7 @@ def test_the_experts_of_other_settings_can_be_measured_by_a_reward(irl, store_co
         *["--reward", "airl", "--store", store_copy.path, "--profile", "smoke"],
     )
     assert done.code == 0, done.err
-    assert "expert of engine-power=1x on airl-irm's reward" in done.err
+    assert "expert of engine-power=1x under AIRL-IRM's reward" in done.err
 
 
 def continuous(path, actions, numbers=None):

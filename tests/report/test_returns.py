@@ -1,4 +1,4 @@
-"""Rows of true returns: the sample is the seed, and no seed counts twice."""
+"""Rows of true returns are samples over seeds, and no seed counts twice."""
 
 import msgspec
 import pytest
@@ -27,7 +27,7 @@ def test_statistics_are_over_seeds():
             evaluation("expert", 250.0, 0),
         ]
     )
-    assert [row.agent for row in found] == ["expert", "airl-irm transfer", "random"]
+    assert [row.agent for row in found] == ["expert", "AIRL-IRM retrained policy", "random"]
     assert found[1].mean == 4.0
     assert found[1].deviation == pytest.approx(13.0**0.5)
     assert found[0].deviation is None
@@ -45,8 +45,11 @@ def test_experts_of_other_settings_are_rows_of_their_own():
     ]
 
 
-def test_a_student_is_zero_shot_only_where_no_one_showed_it_anything():
-    shown = {"bounce=0.9": "airl-irm in distribution", "bounce=0.1": "airl-irm zero-shot"}
+def test_a_student_is_zero_shot_only_without_demonstrations_of_the_setting():
+    shown = {
+        "bounce=0.9": "AIRL-IRM student, in distribution",
+        "bounce=0.1": "AIRL-IRM student, zero-shot",
+    }
     for setting, agent in shown.items():
         (row,) = rows([evaluation("student", 1.0, 0, method="irm", settings=(setting,))])
         assert row.agent == agent
@@ -60,11 +63,13 @@ def test_a_student_is_zero_shot_only_where_no_one_showed_it_anything():
         ),
     )
     found = {row.setting: row.agent for row in rows([(turned, {}, False)])}
-    assert [found[f"direction={v}"].split()[1] for v in ("-5", "-10..0")] == ["in", "in"]
-    assert [found[f"direction={v}"].split()[1] for v in ("-10..10", "10")] == ["zero-shot"] * 2
+    assert [found[f"direction={v}"].split(", ")[1] for v in ("-5", "-10..0")] == [
+        "in distribution"
+    ] * 2
+    assert [found[f"direction={v}"].split(", ")[1] for v in ("-10..10", "10")] == ["zero-shot"] * 2
 
 
-def test_what_another_reward_pays_is_a_row_of_its_own():
+def test_returns_under_another_reward_are_a_row_of_their_own():
     def by_reward(agent, learned, seed, own=False, **subject):
         summary, made, _ = evaluation(agent, 5.0, subject.pop("policy_seed", 0), **subject)
         (place,) = summary.settings
@@ -87,13 +92,13 @@ def test_what_another_reward_pays_is_a_row_of_its_own():
             evaluation("idle", 1.0),
         ]
     )
-    other = "on airl-irm's reward"
+    other = "under AIRL-IRM's reward"
     assert {row.agent: (row.learned, len(row.returns), row.deviation) for row in found} == {
         # One expert under two rewards is no sample of true returns.
         f"expert {other}": (-3.0, 2, None),
-        "airl-irm zero-shot": (6.0, 1, None),
-        "airl-irm transfer": (7.0, 1, None),
-        f"airl-irm transfer {other}": (8.5, 2, 0.0),
+        "AIRL-IRM student, zero-shot": (6.0, 1, None),
+        "AIRL-IRM retrained policy": (7.0, 1, None),
+        f"AIRL-IRM retrained policy {other}": (8.5, 2, 0.0),
         "idle": (None, 1, None),
     }
     twice = [by_reward("expert", 1.0, 4) for _ in range(2)]
@@ -103,9 +108,11 @@ def test_what_another_reward_pays_is_a_row_of_its_own():
         rows(twice)
 
 
-def test_a_seed_that_comes_twice_is_refused():
+def test_a_repeated_seed_is_refused():
     twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
-    with pytest.raises(UsageError, match=r"airl-erm zero-shot in bounce=0\.9 has seed 3 twice"):
+    with pytest.raises(
+        UsageError, match=r"AIRL-ERM student, zero-shot in bounce=0\.9 has seed 3 twice"
+    ):
         rows(twice)
 
 

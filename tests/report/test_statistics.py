@@ -1,4 +1,4 @@
-"""The statistics of a comparison against scipy, brute force, hand-made cases and the paper."""
+"""The statistics of a comparison against scipy, brute force, worked examples and the paper."""
 
 from itertools import chain, combinations
 
@@ -15,6 +15,7 @@ from irlcli.report.statistics import (
     holm,
     identical_runs,
     interquartile_mean,
+    paired_p,
     probability_of_improvement,
     summarise,
 )
@@ -29,18 +30,18 @@ def with_moments(mean, deviation, n=paper.SEEDS):
     return mean + deviation * z / z.std(ddof=1)
 
 
-def test_the_papers_p_values_are_students_and_welch_loses_two_of_them():
+def test_the_papers_p_values_are_students_and_by_welch_two_exceed_5_percent():
     found = {
         row: compare(with_moments(*printed.irm), with_moments(*printed.erm))
         for row, printed in paper.TABLE1.items()
     }
     student = [round(c.student, 4) for c in found.values()]
     assert student == [0.0486, 0.0456, 0.0041, 0.0052]
-    # As printed, but for two digits of the first that changed places.
+    # As printed, except for two swapped digits in the first.
     assert [p.p_value for p in paper.TABLE1.values()] == [0.0458, *student[1:]]
     lost = [row for row, c in found.items() if c.welch > 0.05]
     assert lost == [("lunar-lander", "bounce"), ("lunar-lander", "engine-power")]
-    # After Holm over its four rows, no LunarLander row is left by either test.
+    # After Holm over the four rows, no LunarLander row is significant by either test.
     assert [p <= 0.05 for p in holm(student)] == [False, False, True, True]
     assert found["ant", "friction"].difference == pytest.approx(783.9 - 542.7)
 
@@ -59,7 +60,26 @@ def test_tests_are_scipys(x, y):
     assert found.student == pytest.approx(stats.ttest_ind(x, y).pvalue, abs=1e-12)
 
 
-def test_what_has_no_p_value_says_why():
+@given(st.lists(st.tuples(st.integers(-50, 50), st.integers(-50, 50)), min_size=2, max_size=9))
+def test_the_paired_test_is_a_t_test_of_the_differences(pairs):
+    x, y = np.array(pairs, float).T
+    d, n = x - y, len(pairs)
+    if np.ptp(d) == 0:
+        assert paired_p(x, y) is None
+        return
+    t = d.mean() / (d.std(ddof=1) / n**0.5)
+    assert paired_p(x, y) == pytest.approx(2 * stats.t.sf(abs(t), n - 1), abs=1e-12)
+    assert paired_p(x, y) == pytest.approx(stats.ttest_rel(x, y).pvalue, abs=1e-12)
+
+
+def test_pairs_take_out_what_seeds_share():
+    """Each seed shifts both methods alike: only the paired test sees the constant gain."""
+    x, y = [1.1, 101.2, 201.0, 301.1], [0.0, 100.0, 200.0, 300.0]
+    assert paired_p(x, y) < 0.001 < 0.9 < compare(x, y).welch
+    assert paired_p([1.0], [0.0]) is None
+
+
+def test_a_missing_p_value_has_a_reason():
     one = compare([3.0], [1.0, 2.0])
     assert (one.welch, one.student) == (None, None)
     assert "one seed" in one.why
@@ -82,7 +102,7 @@ def test_improvement_is_mann_whitneys_u(x, y):
 
 @given(p_values)
 def test_holm_is_the_closure_of_bonferroni(values):
-    """A hypothesis falls if every intersection with it falls by Bonferroni."""
+    """A hypothesis is rejected if Bonferroni rejects every intersection that holds it."""
     known = [i for i, p in enumerate(values) if p is not None]
     for i, adjusted in enumerate(holm(values)):
         if values[i] is None:
@@ -135,7 +155,7 @@ def test_interval_is_seeded_and_that_of_all_resamples():
     assert (low, high) == pytest.approx((min(means), max(means)))
 
 
-def test_summary_of_few_seeds():
+def test_few_seeds_are_summarised():
     assert summarise([]).mean is None
     one = summarise([4.0])
     assert (one.n, one.mean, one.deviation, one.interval, one.iqm) == (1, 4.0, None, None, 4.0)
@@ -146,7 +166,7 @@ def test_summary_of_few_seeds():
     assert summarise([0.1, 0.1, 0.1]).deviation == 0.0
 
 
-def test_identical_runs_are_found_to_the_bit():
+def test_identical_runs_are_bitwise_equal():
     episodes = {0: [1.0, 2.0], 1: [1.0, 2.5], 2: [1.0, 2.0], 3: [1.0, 2.5 + 1e-15]}
     assert identical_runs(episodes) == [(0, 2)]
     assert identical_runs({0: [1.0]}) == []

@@ -1,4 +1,4 @@
-"""Pictures of a report: every seed's point, and the learning curves. Files, or SVG for a page."""
+"""Plots of a report: every seed's point, and learning curves, as files or as SVG for a page."""
 
 from __future__ import annotations
 
@@ -16,25 +16,22 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from irlcli.report import paper
-from irlcli.report.results import BASELINES, TITLES, Plan, Report, sample
+from irlcli.report.agents import BASELINES, colours, title
+from irlcli.report.build import Report
+from irlcli.report.compute import sample
+from irlcli.report.parameters import Parameters, Row
+from irlcli.report.result_tables import paper_row
 
-# Okabe and Ito's colours: told apart by colour-blind readers, on white and on black.
-COLOURS = {
-    "erm": "#0072B2",
-    "irm": "#E69F00",
-    "erm-balanced": "#009E73",
-    "irm-shuffled": "#CC79A7",
-}
-_LINES = {"expert": "-", "carried": "-.", "random": "--", "idle": ":"}
+_LINES = {"expert": "-", "reused": "-.", "random": "--", "idle": ":"}
 _LEARNING = {
     "true_return": "true return",
     "progress": "progress",
-    "accuracy": "discriminator accuracy",
-    "penalty": "penalty",
-    "mean_abs_logit": "mean |logit|",
+    "accuracy": "accuracy, fresh",
+    "penalty": "IRMv1, fresh",
+    "optimised_penalty": "penalty, optimised",
+    "mean_abs_logit": "mean |logit|, fresh",
 }
-# A colour that occurs nowhere else, so that a page can put its own in its place.
+# Occurs nowhere else, so that a page can replace it by its own colour.
 _INK = "#010203"
 
 
@@ -57,50 +54,50 @@ def _style(ink: str) -> Iterator[None]:
 
 
 def _svg(figure: plt.Figure, name: str) -> str:
-    """``figure`` as an SVG element whose ink is that of the text around it.
+    """``figure`` as an SVG element that takes its ink from the surrounding text.
 
-    Its ids begin with ``name``: several stand on one page.
+    Its ids start with ``name``, because one page holds several.
     """
     buffer = io.StringIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
+    no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(buffer, format="svg", transparent=True, metadata=no_metadata)
     plt.close(figure)
     text = buffer.getvalue()
     text = re.sub(r'( id="|url\(#|href="#)', rf"\g<1>{name}-", text[text.index("<svg") :])
     return text.replace(_INK, "currentColor").strip()
 
 
-def draw_points(directory: Path, plan: Plan, report: Report) -> str:
-    """Write ``KIND.png`` and ``KIND.pdf``: every seed, the mean, its interval; return the SVG."""
+def draw_points(directory: Path, p: Parameters, report: Report) -> str:
+    """Write ``KIND.png`` and ``KIND.pdf``: every seed, the mean and its interval. Return the SVG."""
     with _style("black"):
-        figure = _points(plan, report)
-        figure.savefig(directory / f"{plan.kind}.png", dpi=130)
-        figure.savefig(directory / f"{plan.kind}.pdf", metadata={"CreationDate": None})
+        figure = _points(p, report)
+        figure.savefig(directory / f"{p.kind}.png", dpi=130)
+        figure.savefig(directory / f"{p.kind}.pdf", metadata={"CreationDate": None})
         plt.close(figure)
     with _style(_INK):
-        return _svg(_points(plan, report), "points")
+        return _svg(_points(p, report), "points")
 
 
-def _points(plan: Plan, report: Report) -> plt.Figure:
-    measures = [m for m in plan.measures if m != "id"]
-    size = (0.6 + 3.2 * len(plan.rows), 0.5 + 2.7 * len(measures))
+def _points(p: Parameters, report: Report) -> plt.Figure:
+    measures = [m for m in p.measures if m != "id"]
+    size = (0.6 + 3.2 * len(p.rows), 0.5 + 2.7 * len(measures))
     figure, axes = plt.subplots(
-        len(measures), len(plan.rows), figsize=size, squeeze=False, layout="constrained"
+        len(measures), len(p.rows), figsize=size, squeeze=False, layout="constrained"
     )
     for line, measure in zip(axes, measures, strict=True):
-        for axis, row in zip(line, plan.rows, strict=True):
-            _panel(axis, plan, report, row, measure)
+        for axis, row in zip(line, p.rows, strict=True):
+            _panel(axis, p, report, row, measure)
         line[0].set_ylabel(f"true return, {measure}")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 
-def _panel(axis, plan: Plan, report: Report, row, measure: str) -> None:
+def _panel(axis: plt.Axes, p: Parameters, report: Report, row: Row, measure: str) -> None:
     ink = plt.rcParams["text.color"]
     cells = report.cells[report.cells["row"] == row.name].set_index(["agent", "measure"])
     for agent in BASELINES:
-        # Drawn without a value too: the legend is that of all panels.
+        # Drawn even without a value, because all panels share the first one's legend.
         value = cells.loc[(agent, "ood"), "mean"]
         axis.axhline(
             np.nan if pd.isna(value) else value,
@@ -108,10 +105,9 @@ def _panel(axis, plan: Plan, report: Report, row, measure: str) -> None:
             lw=0.9,
             ls=_LINES[agent],
             alpha=0.7,
-            label=TITLES[agent],
+            label=title(agent),
         )
-    for x, method in enumerate(plan.methods):
-        colour = COLOURS[method]
+    for x, (method, colour) in enumerate(colours(p.methods).items()):
         values = sample(report.points, row.name, method, measure)["true_return"].to_numpy()
         offsets = (
             np.linspace(-0.16, 0.16, len(values)) if len(values) > 1 else np.zeros(len(values))
@@ -122,13 +118,13 @@ def _panel(axis, plan: Plan, report: Report, row, measure: str) -> None:
             axis.plot([x - 0.25, x + 0.25], [cell["mean"]] * 2, color=colour, lw=2)
         if not pd.isna(cell["low"]):
             axis.plot([x + 0.25] * 2, [cell["low"], cell["high"]], color=colour, lw=1.5)
-    printed = paper.TABLE1.get((row.env, row.knob))
-    if plan.kind == "table1" and measure == "transfer" and printed is not None:
+    printed = paper_row(p, row, measure)
+    if printed is not None:
         theirs = {"erm": printed.erm, "irm": printed.irm}
         for method, value in theirs.items():
-            if method in plan.methods:
+            if method in p.methods:
                 axis.errorbar(
-                    plan.methods.index(method) - 0.33,
+                    p.methods.index(method) - 0.33,
                     value.mean,
                     value.deviation,
                     fmt="D",
@@ -136,37 +132,37 @@ def _panel(axis, plan: Plan, report: Report, row, measure: str) -> None:
                     label="paper, ± sd" if method == next(iter(theirs)) else None,
                 )
     axis.set_xticks(
-        range(len(plan.methods)), [TITLES[m].replace(", ", ",\n") for m in plan.methods], size=7.5
+        range(len(p.methods)), [title(m).replace(", ", ",\n") for m in p.methods], size=7.5
     )
-    axis.set_xlim(-0.6, len(plan.methods) - 0.4)
+    axis.set_xlim(-0.6, len(p.methods) - 0.4)
     axis.set_title(f"{row.env} {row.unseen}")
     axis.grid(axis="y", alpha=0.25)
 
 
-def learning_curves(plan: Plan, learning: Mapping[str, pd.DataFrame]) -> dict[str, str]:
-    """An SVG per row and kind of learning, by title: a thin line per seed, their mean thick.
+def learning_curves(p: Parameters, learning: Mapping[str, pd.DataFrame]) -> dict[str, str]:
+    """An SVG per row and kind of learning, by title: a thin line per seed, a thick one for the mean.
 
     ``learning`` maps ``ROW METHOD SEED reward-learning`` (or ``transfer-learning``) to metrics.
     """
     found = {}
     with _style(_INK):
-        for row in plan.rows:
+        for row in p.rows:
             for kind, what in (
-                ("reward-learning", "learning the reward, in distribution"),
-                ("transfer-learning", "transfer: learning on the frozen reward"),
+                ("reward-learning", "reward learning: the student, in distribution"),
+                ("transfer-learning", "transfer: retraining on the frozen reward"),
             ):
                 runs = {
                     (method, seed): learning[role]
-                    for method in plan.methods
-                    for seed in plan.seeds
+                    for method in p.methods
+                    for seed in p.seeds
                     if (role := f"{row.name} {method} {seed} {kind}") in learning
                 }
                 if runs:
-                    found[f"{row.name}, {what}"] = _svg(_curves(plan, runs), f"curves{len(found)}")
+                    found[f"{row.name}, {what}"] = _svg(_curves(p, runs), f"curves{len(found)}")
     return found
 
 
-def _curves(plan: Plan, runs: Mapping[tuple[str, int], pd.DataFrame]) -> plt.Figure:
+def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> plt.Figure:
     first = next(iter(runs.values()))
     settings = list(dict.fromkeys(first["setting"]))
     names = [n for n in _LEARNING if n in first and first[n].notna().any()]
@@ -182,21 +178,21 @@ def _curves(plan: Plan, runs: Mapping[tuple[str, int], pd.DataFrame]) -> plt.Fig
     )
     for line, name in zip(axes, names, strict=True):
         for axis, setting in zip(line, settings, strict=True):
-            for method in plan.methods:
+            for method, colour in colours(p.methods).items():
                 series = [
                     metrics[metrics["setting"] == setting].set_index("steps")[name]
                     for (m, _), metrics in runs.items()
                     if m == method
                 ]
                 for one in series:
-                    axis.plot(one.index / 1e6, one, color=COLOURS[method], lw=0.6, alpha=0.45)
+                    axis.plot(one.index / 1e6, one, color=colour, lw=0.6, alpha=0.45)
                 if series:
                     mean = pd.concat(series, axis=1).mean(axis=1)
-                    label = f"{TITLES[method]} ({len(series)})"
-                    axis.plot(mean.index / 1e6, mean, color=COLOURS[method], lw=1.7, label=label)
+                    label = f"{title(method)} ({len(series)})"
+                    axis.plot(mean.index / 1e6, mean, color=colour, lw=1.7, label=label)
             axis.grid(alpha=0.25)
-            if name == "penalty":
-                # The unbiased estimate may be negative, and spans decades.
+            if name.endswith("penalty"):
+                # The unbiased estimate may be negative and spans decades.
                 axis.set_yscale("symlog", linthresh=1e-3)
         line[0].set_ylabel(_LEARNING[name])
     for axis, setting in zip(axes[0], settings, strict=True):

@@ -1,4 +1,4 @@
-"""A report laid out as Markdown, LaTeX, and one HTML page that needs nothing else."""
+"""A report as Markdown, as LaTeX, and as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -6,47 +6,49 @@ import json
 from collections.abc import Mapping
 from html import escape
 
-import pandas as pd
-
-from irlcli.report.results import TITLES, Plan, Report, Table, commits, duration, lineage
-from irlcli.report.tables import latex_table, markdown_table
+from irlcli.report.agents import title
+from irlcli.report.build import Report
+from irlcli.report.lineage import commits, duration, evaluations, lineage
+from irlcli.report.parameters import Parameters
+from irlcli.report.tables import Table, latex_table, markdown_table
+from irlcli.report.text import number
 
 
 def latex(report: Report) -> str:
-    """Every table, and what must be known as comments."""
-    notes = "".join(f"% {note}\n" for note in report.notes)
+    """Every table; the caveats are comments."""
+    caveats = "".join(f"% {caveat}\n" for caveat in report.caveats)
     tables = [latex_table(t.columns, t.rows, f"{t.title}. {t.note}".strip()) for t in report.tables]
-    return f"% Needs \\usepackage{{booktabs}}.\n{notes}\n" + "\n".join(tables)
+    return f"% Needs \\usepackage{{booktabs,longtable}}.\n{caveats}\n" + "\n".join(tables)
 
 
-def markdown(plan: Plan, report: Report) -> str:
-    """The whole report but for the learning curves and the lineage."""
-    parts = [f"# {plan.title}\n", f"`{plan.command}`, {_made(plan)}\n"]
-    parts.append(f"![every seed]({plan.kind}.png)\n")
-    if report.notes:
-        parts.append("## Before believing it\n")
-        parts.append("".join(f"- {note}\n" for note in report.notes))
+def markdown(p: Parameters, report: Report) -> str:
+    """The report without learning curves and lineage."""
+    parts = [f"# {p.title}\n", f"`{p.command}`, {_made(p)}\n"]
+    parts.append(f"![every seed]({p.kind}.png)\n")
+    if report.caveats:
+        parts.append("## Caveats\n")
+        parts.append("".join(f"- {caveat}\n" for caveat in report.caveats))
     for table in report.tables:
         parts += [f"## {table.title}\n", markdown_table(table.columns, table.rows)]
         parts += [table.note + "\n"] if table.note else []
     parts.append("## Files\n")
     parts.append(
-        f"`{plan.kind}.csv`: a row per cell. `seeds.csv`: every seed's point. `comparisons.csv`. "
-        f"`{plan.kind}.html`: all of this with learning curves and lineage in one page. "
-        f"`{plan.kind}.tex`: booktabs and longtable. `{plan.kind}.png`, `.pdf`: every seed, the mean, its 95 % "
-        "interval.\n"
+        f"`{p.kind}.csv`: a row per cell. `seeds.csv`: a row per seed and setting. `comparisons.csv`: a "
+        f"row per comparison. `{p.kind}.json`: all numbers. `{p.kind}.html`: all of this with learning "
+        f"curves and lineage on one page. `{p.kind}.tex`: needs booktabs and longtable. `{p.kind}.png`, "
+        "`.pdf`: every seed, the mean, its 95 % interval.\n"
     )
     return "\n".join(parts)
 
 
-def _made(plan: Plan) -> str:
-    # An intermediate result that nothing shown stands on is not counted.
-    runs = [plan.runs[i] for i in lineage(plan, (c.run for c in plan.cells if c.run))]
+def _made(p: Parameters) -> str:
+    # Only runs behind a number that is shown.
+    runs = [p.runs[i] for i in lineage(p, evaluations(p.cells))]
     states = {state for run in runs for state in run.code}
     named = sorted({state.commit or "unknown" for state in states})
     dirty = " with uncommitted changes" if any(state.dirty for state in states) else ""
     total = duration(sum(run.seconds or 0.0 for run in runs))
-    return f"on {len(runs)} runs, {total} in all, made at commit {', '.join(named)}{dirty}."
+    return f"from {len(runs)} runs that took {total}, at commit {', '.join(named)}{dirty}."
 
 
 # HTML
@@ -71,13 +73,13 @@ tbody th { font-weight: normal; }
 tr.paper td, tr.paper th { font-style: italic; opacity: .8; }
 figure { margin: 1rem 0; } figure svg { max-width: 100%; height: auto; }
 pre { font-size: .82rem; overflow-x: auto; } summary { cursor: pointer; padding: .15rem 0; }
-.notes li { margin: .2rem 0; }
+.caveats li { margin: .2rem 0; }
 @media print { nav, .skip { display: none; } body { font-size: 10pt; max-width: none; }
   .wide { overflow: visible; } figure, tr { break-inside: avoid; } h2 { break-after: avoid; } }
 """
 
 
-def html(plan: Plan, report: Report, points: str, curves: Mapping[str, str]) -> str:
+def html(p: Parameters, report: Report, points: str, curves: Mapping[str, str]) -> str:
     """One self-contained page.
 
     Args:
@@ -86,40 +88,40 @@ def html(plan: Plan, report: Report, points: str, curves: Mapping[str, str]) -> 
     """
     sections = [
         (
-            "Before believing it",
-            f'<ul class="notes">{"".join(f"<li>{escape(n)}</li>" for n in report.notes)}</ul>'
-            if report.notes
-            else "<p>Nothing is missing, mixed or left out.</p>",
+            "Caveats",
+            f'<ul class="caveats">{"".join(f"<li>{escape(c)}</li>" for c in report.caveats)}</ul>'
+            if report.caveats
+            else "<p>None: no run is missing, mixed or left out.</p>",
         ),
-        *((t.title, _html_table(t)) for t in report.tables[: len(plan.measures)]),
+        *((t.title, _html_table(t)) for t in report.tables[: len(p.measures)]),
         ("Every seed", _figure("Every seed, the mean and its 95 % bootstrap interval.", points)),
-        *((t.title, _html_table(t)) for t in report.tables[len(plan.measures) :]),
+        *((t.title, _html_table(t)) for t in report.tables[len(p.measures) :]),
         ("Every seed in numbers", _html_table(_seeds(report))),
         (
             "Learning curves",
-            "<p>A thin line is a seed, the thick one their mean. The true return is only looked at, "
-            "never learned from.</p>" + "".join(_figure(t, svg) for t, svg in curves.items())
+            "<p>A thin line is a seed, the thick one their mean. The true return is only recorded; "
+            "no policy learns from it.</p>" + "".join(_figure(t, svg) for t, svg in curves.items())
             if curves
-            else "<p>No learning curve is there yet.</p>",
+            else "<p>No learning curves exist yet.</p>",
         ),
-        ("Lineage", _lineage(plan)),
-        ("Settings and libraries", _settings(plan)),
+        ("Lineage", _lineage(p)),
+        ("Configs and libraries", _configs(p)),
     ]
     body = "".join(
-        f'<section id="s{i}"><h2>{escape(title)}</h2>{content}</section>'
-        for i, (title, content) in enumerate(sections)
+        f'<section id="s{i}"><h2>{escape(heading)}</h2>{content}</section>'
+        for i, (heading, content) in enumerate(sections)
     )
     links = "".join(
-        f'<li><a href="#s{i}">{escape(title.partition(":")[0])}</a></li>'
-        for i, (title, _) in enumerate(sections)
+        f'<li><a href="#s{i}">{escape(heading.partition(":")[0])}</a></li>'
+        for i, (heading, _) in enumerate(sections)
     )
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(plan.title)}</title><style>{_CSS}</style></head><body>"
+        f"<title>{escape(p.title)}</title><style>{_CSS}</style></head><body>"
         '<a class="skip" href="#content">Skip to the results</a>'
-        f"<header><h1>{escape(plan.title)}</h1>"
-        f"<p><code>{escape(plan.command)}</code>, {escape(_made(plan))}</p></header>"
+        f"<header><h1>{escape(p.title)}</h1>"
+        f"<p><code>{escape(p.command)}</code>, {escape(_made(p))}</p></header>"
         f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
         f'<main id="content">{body}</main></body></html>\n'
     )
@@ -140,7 +142,7 @@ def _html_table(table: Table) -> str:
         ]
         kind = ' class="paper"' if row[1] == "paper" else ""
         lines.append(f"<tr{kind}>{''.join(cells)}</tr>")
-    # Focusable, so that a keyboard can scroll what is wider than the page.
+    # Focusable, so that the keyboard can scroll a table that is wider than the page.
     return (
         f'<div class="wide" tabindex="0" role="region" aria-label="{escape(table.title)}"><table>'
         f"<caption>{escape(table.note or table.title)}</caption><thead><tr>{head}</tr></thead>"
@@ -151,55 +153,58 @@ def _html_table(table: Table) -> str:
 def _seeds(report: Report) -> Table:
     rows = [
         [
-            p.row,
-            TITLES[p.agent],
-            p.measure,
-            "-" if pd.isna(p.seed) else f"{p.seed:.0f}",
-            p.setting,
-            f"{p.true_return:.1f}",
-            *("-" if pd.isna(v) else f"{v:.1f}" for v in (p.progress, p.learned_return)),
-            str(p.episodes),
-            p.evaluation,
+            point.row,
+            title(point.agent),
+            point.measure,
+            number(point.seed, 0),
+            point.setting,
+            number(point.true_return),
+            number(point.progress),
+            number(point.learned_return),
+            str(point.episodes),
+            point.evaluation,
         ]
-        for p in report.points.itertuples()
+        for point in report.points.itertuples()
     ]
     columns = ["row", "agent", "measure", "seed", "setting", "true return", "progress"]
     columns += ["learned return", "episodes", "evaluation"]
-    note = "A number is the mean over an evaluation's episodes."
+    note = "Means over the episodes of an evaluation."
     return Table("Every seed in numbers", note, columns, rows, 5)
 
 
-def _lineage(plan: Plan) -> str:
-    """For every cell, the artefacts it was made from, down to the experts."""
+def _lineage(p: Parameters) -> str:
+    """For every cell, the artefacts behind it, down to the experts."""
     parts = []
-    for cell in plan.cells:
+    for cell in p.cells:
         if cell.run:
             seed = "" if cell.seed is None else f", seed {cell.seed}"
             place = f", {cell.place}" if cell.place else ""
-            title = f"{cell.row}, {TITLES[cell.agent]}, {cell.measure}{place}{seed}"
-            tree = escape("\n".join(_tree(plan, cell.run, "")))
-            parts.append(f"<details><summary>{escape(title)}</summary><pre>{tree}</pre></details>")
+            heading = f"{cell.row}, {title(cell.agent)}, {cell.measure}{place}{seed}"
+            tree = escape("\n".join(_tree(p, cell.run, "")))
+            parts.append(
+                f"<details><summary>{escape(heading)}</summary><pre>{tree}</pre></details>"
+            )
     return "".join(parts)
 
 
-def _tree(plan: Plan, id16: str, indent: str) -> list[str]:
-    if id16 not in plan.runs:
-        return [f"{indent}{id16}  not among the runs planned for"]
-    run = plan.runs[id16]
+def _tree(p: Parameters, id16: str, indent: str) -> list[str]:
+    if id16 not in p.runs:
+        return [f"{indent}{id16}  not a run of this report"]
+    run = p.runs[id16]
     took = "" if run.seconds is None else f"  {duration(run.seconds)}"
     line = f"{indent}{id16}  {run.stage}  {run.about}{took}  at {', '.join(commits([run]))}"
-    return [line, *(x for i in run.inputs for x in _tree(plan, i, indent + "  "))]
+    return [line, *(x for i in run.inputs for x in _tree(p, i, indent + "  "))]
 
 
-def _settings(plan: Plan) -> str:
+def _configs(p: Parameters) -> str:
     parts = [
         f"<details><summary>{escape(row.name)}</summary><pre>"
-        f"{escape(json.dumps(row.settings, indent=1, sort_keys=True))}</pre></details>"
-        for row in plan.rows
+        f"{escape(json.dumps(row.config, indent=1, sort_keys=True))}</pre></details>"
+        for row in p.rows
     ]
     parts += [
         f"<details><summary>libraries {escape(name)}</summary><pre>"
         f"{escape(json.dumps(versions, indent=1, sort_keys=True))}</pre></details>"
-        for name, versions in plan.libraries.items()
+        for name, versions in p.libraries.items()
     ]
     return "".join(parts)

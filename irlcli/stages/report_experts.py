@@ -1,26 +1,26 @@
-"""What the experts of every setting earn, how they learned, and where their training stands.
+"""What the experts of every setting earn, how they learned, and which are missing.
 
-Its inputs are evaluations and learning curves, known by their content. Which run on which commit
-took how long are parameters, so that equal requests give equal bytes.
+Its inputs are evaluations and metrics, known by their content. What else it prints (which run took
+how long, at which commit) are parameters, so that equal requests give equal bytes.
 """
 
 from collections.abc import Mapping
 
 import msgspec
 
+from irlcli.report.parameters import Cell, Run
 from irlcli.stages.base import Job, Request, Source, Stage
-from irlcli.stages.results import Cell, Run
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What the report depends on, besides its evaluations and learning curves.
+    """What the report depends on, besides its evaluations and metrics.
 
     Attributes:
-        command: how to ask for it again; printed in it.
+        command: the command line that produces this report; printed in it.
         steps: the budget of an expert, by environment.
-        bars: the mean true return an expert must reach, by environment that has a bar.
+        bars: the least mean true return of an expert, by environment that has a bar.
         cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``; each ``place`` is a setting.
-        runs: facts on the artefacts, by id.
+        runs: provenance of the artefacts, by id.
     """
 
     command: str
@@ -40,7 +40,7 @@ def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
 
 
 def run(job: Job) -> None:
-    """Read the evaluations and curves, and lay them out."""
+    """Read the evaluations and metrics, and lay them out."""
     import pandas as pd
 
     from irlcli.data import descriptions
@@ -61,13 +61,15 @@ def run(job: Job) -> None:
         for role, path in job.inputs.items()
         if role.endswith(" learning")
     }
-    found = experts.table(p.cells, p.runs, p.steps, summaries)
-    text = experts.text_table(found)
-    notes = experts.notes(p.cells, found, p.bars)
-    found.to_csv(job.output / "experts.csv", index=False, float_format="%.6g", lineterminator="\n")
-    write_json(job.output / "experts.json", {"tables": [text], "notes": notes})
-    (job.output / "README.md").write_text(experts.markdown(p.command, text, notes))
+    numbers = experts.summarise(p.cells, p.runs, p.steps, summaries)
+    table = experts.text_table(numbers)
+    caveats = experts.caveats(p.cells, numbers, p.bars)
+    numbers.to_csv(
+        job.output / "experts.csv", index=False, float_format="%.6g", lineterminator="\n"
+    )
+    write_json(job.output / "experts.json", {"tables": [table._asdict()], "caveats": caveats})
+    (job.output / "README.md").write_text(experts.markdown(p.command, table, caveats))
     experts.draw(job.output, p.cells, learning)
 
 
-STAGE = Stage("report-experts", 1, run)
+STAGE = Stage("report-experts", 2, run)

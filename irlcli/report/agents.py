@@ -1,0 +1,46 @@
+"""What agents and measures are called and how they are drawn. Methods come from their table."""
+
+from irlcli.methods import METHODS
+
+BASELINES = {
+    "expert": "expert",
+    "reused": "training experts, reused",
+    "random": "random",
+    "idle": "idle",
+}
+MEASURES = {
+    "transfer": "Transfer: the policy retrained on the frozen reward, in the held-out setting",
+    "zero-shot": "Zero-shot: the student, in the held-out setting",
+    "id": "In distribution: the student, mean over the training settings",
+}
+# For methods outside the table: what Okabe and Ito's palette has left, then greys.
+_OTHER_COLOURS = ("#56B4E9", "#D55E00", "#F0E442", "#777777", "#AAAAAA")
+
+
+def title(agent: str) -> str:
+    """The title of a method or baseline; a method outside the table is called by its name."""
+    if agent in METHODS:
+        return METHODS[agent].title
+    return BASELINES.get(agent, agent)
+
+
+def colours(methods: tuple[str, ...]) -> dict[str, str]:
+    """A colour for each of ``methods``. Those outside the table share a cycle of five."""
+    others = [name for name in methods if name not in METHODS]
+    cycle = {name: _OTHER_COLOURS[i % len(_OTHER_COLOURS)] for i, name in enumerate(others)}
+    return {name: METHODS[name].colour if name in METHODS else cycle[name] for name in methods}
+
+
+def comparisons(methods: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Pairs (x, y) to compare: each method that seeks invariance with each that does not.
+
+    A method seeks invariance if it penalises the risks of the settings as they are labelled.
+    """
+    seeking = [
+        name
+        for name in methods
+        if name in METHODS
+        and METHODS[name].grouping == "per-setting"
+        and METHODS[name].penalty != "none"
+    ]
+    return [(x, y) for x in seeking for y in methods if y not in seeking]

@@ -1,0 +1,92 @@
+"""A report from its points: every number, table and caveat, before it is laid out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from irlcli.report import caveats, compute, result_tables
+from irlcli.report.parameters import Parameters
+from irlcli.report.tables import Table
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """The content of a report.
+
+    Attributes:
+        points: a row per evaluation and setting, see :mod:`irlcli.report.compute`.
+        cells: see :func:`irlcli.report.compute.summarise_cells`.
+        comparisons: see :func:`irlcli.report.compute.compare_methods`.
+        learned_returns: see :func:`irlcli.report.compute.learned_returns`.
+        discriminators: see :func:`irlcli.report.compute.discriminator_ends`.
+        tables: the same for people.
+        caveats: what a reader must know before drawing conclusions.
+    """
+
+    points: pd.DataFrame
+    cells: pd.DataFrame
+    comparisons: pd.DataFrame
+    learned_returns: pd.DataFrame
+    discriminators: pd.DataFrame
+    tables: list[Table]
+    caveats: list[str]
+
+
+def build(
+    p: Parameters, points: pd.DataFrame, episodes: caveats.Episodes, learning: compute.Learning
+) -> Report:
+    """The report on ``points``.
+
+    Args:
+        p: what the report is about.
+        points: a row per evaluation and setting, see :mod:`irlcli.report.compute`.
+        episodes: the true returns by (row, measure), then (method, seed).
+        learning: the metrics of ``train-airl`` by (row, method, seed).
+    """
+    cells = compute.summarise_cells(p, points)
+    comparisons = compute.compare_methods(p, points, cells)
+    learned_returns = compute.learned_returns(p, points)
+    discriminators = compute.discriminator_ends(p, learning)
+    tables = [
+        *result_tables.measures(p, cells, comparisons),
+        result_tables.learned_returns(learned_returns),
+        result_tables.comparisons(comparisons),
+        result_tables.discriminators(discriminators),
+        result_tables.cells(cells),
+        result_tables.budgets(p),
+        result_tables.costs(p),
+    ]
+    found = [
+        *caveats.missing(p),
+        *caveats.not_imitated(cells),
+        *caveats.short_of_expert(learned_returns),
+        *caveats.saturated(discriminators),
+        *caveats.identical(episodes),
+        *caveats.without_p(comparisons),
+        *caveats.shared_demonstrations(p),
+        *caveats.left_out(p),
+        *caveats.mixed(p),
+    ]
+    tables = [table for table in tables if table.rows]
+    return Report(points, cells, comparisons, learned_returns, discriminators, tables, found)
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The report as JSON values; missing numbers are None."""
+
+    def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+        plain = table.astype(object).where(table.notna(), None)
+        return plain.to_dict("records")
+
+    return {
+        "cells": records(report.cells),
+        "comparisons": records(report.comparisons),
+        "learned_returns": records(report.learned_returns),
+        "discriminators": records(report.discriminators),
+        "points": records(report.points),
+        "tables": [table._asdict() for table in report.tables],
+        "caveats": report.caveats,
+    }

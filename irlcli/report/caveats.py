@@ -1,0 +1,178 @@
+"""What a reader must know before drawing conclusions from a report, one sentence or two each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from irlcli.report.agents import title
+from irlcli.report.compute import IMITATED, failed_to_imitate
+from irlcli.report.lineage import evaluations, is_mixed, lineage, origins, short
+from irlcli.report.parameters import Cell, Code, Parameters
+from irlcli.report.statistics import identical_runs
+from irlcli.report.text import percent
+
+# At this accuracy, the gradient of the penalty is close to zero.
+SATURATED = 0.95
+
+Episodes = Mapping[tuple[str, str], Mapping[tuple[str, int], np.ndarray]]
+
+
+def missing(p: Parameters) -> list[str]:
+    """A caveat per row: which evaluations are missing, and what they wait for."""
+    found = []
+    for row in p.rows:
+        cells = [c for c in p.cells if c.row == row.name]
+        reasons: dict[str, dict[str, dict[str, None]]] = {}
+        for c in cells:
+            if not c.run:
+                reasons.setdefault(c.why, {}).setdefault(_waiting(c), {})[_which(c)] = None
+        parts = [
+            f"{why}: "
+            + "; ".join(f"{agent} {', '.join(which)}".strip() for agent, which in agents.items())
+            for why, agents in reasons.items()
+        ]
+        if parts:
+            exist = len(evaluations(cells))
+            found.append(
+                f"Missing: {row.name}: {exist} of {len(cells)} evaluations exist. "
+                f"{'. '.join(parts)}."
+            )
+    return found
+
+
+def _waiting(cell: Cell) -> str:
+    # A run has several evaluations; any other stage stands for all of them.
+    several = cell.seed is not None and cell.why.startswith("evaluate")
+    return f"{title(cell.agent)} {cell.measure}" if several else title(cell.agent)
+
+
+def _which(cell: Cell) -> str:
+    return cell.place if cell.seed is None else str(cell.seed)
+
+
+def not_imitated(cells: pd.DataFrame) -> list[str]:
+    """Students that stay below their experts in distribution."""
+    found = []
+    for r in cells.itertuples():
+        if failed_to_imitate(r):
+            share = "" if r.of_expert is pd.NA else f" ({r.of_expert:.1%} of the expert's return)"
+            found.append(
+                f"Not imitated: {r.row}, {title(r.agent)}: in distribution the student stays below "
+                f"{IMITATED:.0%} of the expert{share}. Do not interpret gaps to other methods."
+            )
+    return found
+
+
+def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
+    """Retrained policies that fall short of the expert: a wrong reward, or failed optimisation."""
+    found = []
+    for r in learned_returns.itertuples():
+        if r.short:
+            higher, lower = r.short_scored_higher, r.short - r.short_scored_higher
+            parts = [
+                f"The reward scores {higher} of them above the expert: it prefers a worse policy."
+            ] * (higher > 0)
+            parts += [
+                f"It does not score {lower} of them above the expert, so optimisation fell short."
+            ] * (lower > 0)
+            found.append(
+                f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.seeds} retrained "
+                f"policies. {' '.join(parts)}"
+            )
+    return found
+
+
+def saturated(ends: pd.DataFrame) -> list[str]:
+    """Discriminators that are nearly always right, which makes the penalty vacuous."""
+    return [
+        f"Saturated: {r.row}, {title(r.agent)}: at the end of training the discriminator classifies "
+        f"{r.accuracy:.1%} of fresh samples correctly, and lambda times the optimised penalty is "
+        f"{percent(r.share)} of the optimised cross-entropy. The penalty has little left to change."
+        for r in ends.itertuples()
+        if r.penalty_weight > 0 and r.accuracy >= SATURATED
+    ]
+
+
+def identical(episodes: Episodes) -> list[str]:
+    """Runs that are bitwise equal: seeds that are no sample, or a method without effect.
+
+    Args:
+        episodes: the true returns by (row, measure), then (method, seed).
+    """
+    groups: dict[tuple[str, tuple], list[str]] = {}
+    for (row, measure), found in episodes.items():
+        for runs in identical_runs(found):
+            groups.setdefault((row, runs), []).append(measure)
+    return [
+        f"Identical: {row}, {', '.join(measures)}: "
+        f"{', '.join(f'{title(a)} seed {s}' for a, s in runs)} have bitwise equal returns: neither "
+        "seed nor method made a difference between them."
+        for (row, runs), measures in groups.items()
+    ]
+
+
+def without_p(comparisons: pd.DataFrame) -> list[str]:
+    """A caveat per row and reason; the table of comparisons tells which."""
+    counts = comparisons[comparisons["why"] != ""].groupby(["row", "why"], sort=False).size()
+    total = comparisons.groupby("row", sort=False).size()
+    return [
+        f"No p-value: {row}: {n} of {total[row]} comparisons: {why}."
+        for (row, why), n in counts.items()
+    ]
+
+
+def shared_demonstrations(p: Parameters) -> list[str]:
+    """Rows in which several seeds learn from one set of demonstrations."""
+    rows = []
+    for row in p.rows:
+        cells = [c for c in p.cells if c.row == row.name and c.seed is not None and c.run]
+        seeds = {c.seed for c in cells}
+        behind = lineage(p, evaluations(cells))
+        sets = [i for i in behind if p.runs[i].stage == "collect-experts"]
+        if len(sets) == 1 and len(seeds) > 1:
+            rows.append(row.name)
+    if not rows:
+        return []
+    return [
+        f"Shared demonstrations: {', '.join(rows)}: all seeds and methods of a row learn from one set "
+        "of demonstrations, by one expert per setting. Seeds vary the reward learning and what "
+        "follows from it; deviations, intervals and p-values do not cover other experts or "
+        "demonstrations."
+    ]
+
+
+def left_out(p: Parameters) -> list[str]:
+    """Runs for a cell of the report that were made with other parameters."""
+    return [
+        f"Left out: {_runs(len(o.ids))} of {o.stage}, {o.about} ({', '.join(o.ids)}): {o.why}."
+        for o in p.others
+    ]
+
+
+def mixed(p: Parameters) -> list[str]:
+    """Rows whose runs differ in code or library versions."""
+    found = []
+    for row in p.rows:
+        made = origins(p, evaluations(c for c in p.cells if c.row == row.name))
+        if is_mixed(made):
+            parts = [
+                f"commit {_attempts(origin.code)}, libraries {origin.libraries}: {_runs(len(ids))}"
+                for origin, ids in made.items()
+            ]
+            found.append(
+                f"Mixed: {row.name}: its runs differ in code or library versions: {'; '.join(parts)}."
+            )
+    return found
+
+
+def _attempts(code: tuple[Code, ...]) -> str:
+    return " then ".join(
+        f"{short(state)}{' with changes ' + state.dirty if state.dirty else ''}" for state in code
+    )
+
+
+def _runs(count: int) -> str:
+    return f"{count} run" if count == 1 else f"{count} runs"

@@ -1,0 +1,228 @@
+"""The numbers of a report: cells, comparisons, learned returns, and the discriminators' ends.
+
+Every function takes *points*, a row per evaluation and setting with the columns
+
+    row           ENV KNOB
+    agent         method or baseline
+    measure       transfer, zero-shot, id, ood, or "expert by reward"
+    seed          of the reward learning; missing for baselines
+    expert_of     the setting in which an expert was trained
+    setting       the setting of the evaluation
+    true_return, progress, learned_return
+                  means over episodes; progress and learned return may be missing
+    episodes      their number
+    evaluation    id of the artefact
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from irlcli.report.agents import BASELINES, comparisons
+from irlcli.report.lineage import evaluations, is_mixed, origins
+from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
+from irlcli.report.statistics import compare, holm, paired_p, summarise
+
+# A student imitates if its return is within a fifth of its expert's.
+IMITATED = 0.8
+_DIAGNOSTICS = (
+    "accuracy",
+    "mean_abs_logit",
+    "cross_entropy",
+    "penalty",
+    "optimised_cross_entropy",
+    "optimised_penalty",
+    "penalty_weight",
+)
+
+Learning = Mapping[tuple[str, str, int], pd.DataFrame]
+
+
+def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
+    """``true_return`` and ``progress`` by seed, means over settings."""
+    chosen = points[
+        (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
+    ]
+    by_seed = chosen.groupby("seed", dropna=False, sort=True)
+    return by_seed[["true_return", "progress"]].mean()
+
+
+def imitates(student: float | None, expert: float | None) -> bool | None:
+    """Whether a true return is within a fifth of an expert's; None if either is unknown.
+
+    For a positive return this is the 80 % rule. For a negative one the ratio would have the
+    opposite meaning.
+    """
+    if student is None or expert is None:
+        return None
+    return student >= expert - (1 - IMITATED) * abs(expert)
+
+
+def failed_to_imitate(cell: Any) -> bool:
+    """Whether a row of :func:`summarise_cells` is a student's that did not reach its expert."""
+    return cell.imitated is not pd.NA and not cell.imitated
+
+
+def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
+    """A row per row, agent and measure.
+
+    Columns: ``row``, ``agent``, ``measure``, ``setting``; ``seeds`` and ``seeds_wanted``; ``mean``,
+    ``deviation`` (n - 1), ``low`` and ``high`` (95 % bootstrap interval) and ``iqm`` of the true
+    return over seeds; ``progress``, its mean; ``complete``, whether all evaluations exist;
+    ``mixed``, whether the runs behind them differ in code or libraries; ``of_expert``, the mean
+    over that of the training settings' experts, in distribution; ``imitated``, see
+    :func:`imitates`.
+    """
+    found = []
+    for row in p.rows:
+        wanted = [(agent, "ood") for agent in BASELINES]
+        if "id" in p.measures:
+            wanted += [("expert", "id"), ("reused", "id")]
+        wanted += [(method, m) for m in p.measures for method in p.methods]
+        for agent, measure in wanted:
+            values = sample(points, row.name, agent, measure)
+            s = summarise(values["true_return"].tolist())
+            low, high = s.interval or (None, None)
+            progress = values["progress"].mean() if len(values) else math.nan
+            planned = [
+                c for c in p.cells if (c.row, c.agent, c.measure) == (row.name, agent, measure)
+            ]
+            found.append(
+                {
+                    "row": row.name,
+                    "agent": agent,
+                    "measure": measure,
+                    "setting": ", ".join(row.trained) if measure == "id" else row.unseen,
+                    "seeds": s.n,
+                    "seeds_wanted": len(p.seeds) if agent in p.methods else 1,
+                    "mean": s.mean,
+                    "deviation": s.deviation,
+                    "low": low,
+                    "high": high,
+                    "iqm": s.iqm,
+                    "progress": None if math.isnan(progress) else float(progress),
+                    "complete": all(c.run for c in planned),
+                    "mixed": is_mixed(origins(p, evaluations(planned))),
+                }
+            )
+    return _with_imitation(p, pd.DataFrame(found))
+
+
+def _with_imitation(p: Parameters, table: pd.DataFrame) -> pd.DataFrame:
+    """``table`` with the columns ``of_expert`` and ``imitated``."""
+    experts = table[(table["agent"] == "expert") & (table["measure"] == "id") & table["complete"]]
+    expert_means = experts.set_index("row")["mean"].to_dict()
+    of_expert, imitated = [], []
+    for r in table.itertuples():
+        expert, mean = expert_means.get(r.row), None if pd.isna(r.mean) else r.mean
+        is_student = r.agent in p.methods
+        known = r.measure == "id" and expert is not None and mean is not None
+        compared = known and (is_student or (r.agent == "reused" and r.complete))
+        of_expert.append(mean / expert if compared and expert > 0 else None)
+        imitated.append(imitates(mean, expert) if known and is_student else None)
+    return table.assign(
+        of_expert=pd.array(of_expert, "Float64"), imitated=pd.array(imitated, "boolean")
+    )
+
+
+def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) -> pd.DataFrame:
+    """A row per row, measure and pair of methods (x, y).
+
+    Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means; two-sided p-values
+    ``p_welch`` (primary), ``p_welch_holm`` (over the rows), ``p_paired`` (over the ``pairs`` seeds
+    that both methods have) and ``p_student``; ``improvement``, the probability that a seed of x
+    beats one of y; ``not_imitated``, which of the two failed in distribution; ``why``, the reason
+    for a missing Welch test.
+    """
+    students = cells[(cells["measure"] == "id") & cells["agent"].isin(p.methods)]
+    failed = {(r.row, r.agent) for r in students.itertuples() if failed_to_imitate(r)}
+    found = []
+    for measure in p.measures:
+        for x, y in comparisons(p.methods):
+            samples = [
+                [sample(points, row.name, agent, measure)["true_return"] for agent in (x, y)]
+                for row in p.rows
+            ]
+            tested = [compare(a.tolist(), b.tolist()) for a, b in samples]
+            adjusted = holm([c.welch for c in tested])
+            for row, (a, b), c, p_holm in zip(p.rows, samples, tested, adjusted, strict=True):
+                common = a.index.intersection(b.index)
+                found.append(
+                    {
+                        "row": row.name,
+                        "measure": measure,
+                        "x": x,
+                        "y": y,
+                        "difference": c.difference,
+                        "p_welch": c.welch,
+                        "p_welch_holm": p_holm,
+                        "p_paired": paired_p(a[common].tolist(), b[common].tolist()),
+                        "pairs": len(common),
+                        "p_student": c.student,
+                        "improvement": c.improvement,
+                        "not_imitated": " ".join(m for m in (x, y) if (row.name, m) in failed),
+                        "why": c.why,
+                    }
+                )
+    columns = ["row", "measure", "x", "y", "difference", "p_welch", "p_welch_holm", "p_paired"]
+    columns += ["pairs", "p_student", "improvement", "not_imitated", "why"]
+    return pd.DataFrame(found, columns=columns)
+
+
+def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
+    """What the frozen rewards score, a row per row and method.
+
+    Columns: ``row``, ``agent``; ``seeds`` that have both evaluations; ``retrained`` and
+    ``expert``, mean learned returns of the retrained policies and of the held-out setting's expert;
+    ``short``, seeds whose retrained policy does not come within a fifth of the expert's true
+    return; ``short_scored_higher``, those of them that the reward scores above the expert.
+    """
+    columns = ["row", "agent", "seeds", "retrained", "expert", "short", "short_scored_higher"]
+    found = []
+    for row in p.rows if "transfer" in p.measures else ():
+        for method in p.methods:
+            of = points[(points["row"] == row.name) & (points["agent"] == method)]
+            of = of[of["learned_return"].notna()]
+            policies, experts = (of[of["measure"] == m] for m in ("transfer", EXPERT_BY_REWARD))
+            both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
+            if both.empty:
+                continue
+            returns = zip(both["true_return"], both["true_return_expert"], strict=True)
+            short = np.array([not imitates(policy, expert) for policy, expert in returns])
+            retrained, expert = both["learned_return"], both["learned_return_expert"]
+            means = float(retrained.mean()), float(expert.mean())
+            counts = int(short.sum()), int((short & (retrained > expert)).sum())
+            found.append((row.name, method, len(both), *means, *counts))
+    return pd.DataFrame(found, columns=columns)
+
+
+def discriminator_ends(p: Parameters, learning: Learning) -> pd.DataFrame:
+    """The discriminator over the last tenth of the rounds, a row per row and method.
+
+    Columns: ``row``, ``agent``, ``seeds``; means over settings and seeds of the metrics of
+    ``train-airl``; ``share``, lambda times the optimised penalty over the optimised cross-entropy,
+    None if that is zero. ``cross_entropy`` and ``penalty`` are of fresh samples, the optimised ones
+    of the minibatches that were minimised.
+    """
+    found = []
+    for row in p.rows:
+        for method in p.methods:
+            runs = [m for (r, a, _), m in learning.items() if (r, a) == (row.name, method)]
+            if not runs:
+                continue
+            ends = []
+            for metrics in runs:
+                end = metrics[metrics["round"] >= 0.9 * metrics["round"].max()]
+                weighted = end["penalty_weight"] * end["optimised_penalty"]
+                ends.append(end[list(_DIAGNOSTICS)].assign(weighted=weighted).mean())
+            means = pd.concat(ends, axis=1).mean(axis=1)
+            weighted, entropy = means.pop("weighted"), means["optimised_cross_entropy"]
+            share = weighted / entropy if entropy > 0 else None
+            values = {"row": row.name, "agent": method, "seeds": len(runs), "share": share}
+            found.append(values | means.to_dict())
+    return pd.DataFrame(found, columns=["row", "agent", "seeds", "share", *_DIAGNOSTICS])

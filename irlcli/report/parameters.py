@@ -1,0 +1,129 @@
+"""What a report is about: the evaluations it wants, those that exist, and how they were made.
+
+These are parameters of the stages ``report`` and ``report-experts``. Importing them loads nothing
+heavy, because planning a report needs them.
+"""
+
+from typing import Any
+
+import msgspec
+
+# The measure of cells in which the held-out setting's expert is scored by a learned reward.
+EXPERT_BY_REWARD = "expert by reward"
+
+
+class Cell(msgspec.Struct, frozen=True):
+    """One evaluation that the report needs.
+
+    Attributes:
+        row: ``ENV KNOB``.
+        agent: a method, ``expert``, ``random``, ``idle``, or ``reused``: the expert of a training
+            setting, evaluated in the settings in which the students are evaluated.
+        measure: ``transfer`` (the retrained policy), ``zero-shot`` or ``id`` (the student, in the
+            held-out setting or in distribution), ``ood`` for an agent without a reward, or
+            ``expert by reward``: the held-out setting's expert, scored by this seed's reward.
+        seed: of the reward learning; None for agents without one.
+        place: the setting in which an expert was trained, or in which another agent is evaluated.
+        run: id of the evaluation; empty if it is missing.
+        why: what a missing one waits for.
+    """
+
+    row: str
+    agent: str
+    measure: str
+    seed: int | None = None
+    place: str = ""
+    run: str = ""
+    why: str = ""
+
+    @property
+    def role(self) -> str:
+        """Name of the evaluation among the stage's inputs."""
+        seed = "-" if self.seed is None else self.seed
+        return f"{self.row} {self.agent} {seed} {self.measure} {self.place}".strip()
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One environment and knob.
+
+    Attributes:
+        trained: the settings trained in.
+        unseen: the held-out setting.
+        demonstrations: episodes of each setting trained in.
+        config: the configs of the row's stages, by stage, as JSON values.
+        chosen: lambda by ``METHOD SEED``, where it was chosen by leaving a setting out.
+    """
+
+    env: str
+    knob: str
+    trained: tuple[str, ...]
+    unseen: str
+    demonstrations: tuple[int, ...]
+    config: dict[str, Any]
+    chosen: dict[str, float] = {}
+
+    @property
+    def name(self) -> str:
+        """``ENV KNOB``."""
+        return f"{self.env} {self.knob}"
+
+
+class Code(msgspec.Struct, frozen=True, kw_only=True):
+    """The code of a run: a commit, and a digest of uncommitted changes. None means unknown."""
+
+    commit: str | None
+    dirty: str | None
+
+
+class Run(msgspec.Struct, frozen=True, kw_only=True):
+    """The provenance of one artefact; None where it does not tell.
+
+    Attributes:
+        about: environment, settings, method and agent, for people.
+        code: the code of each of its attempts.
+        libraries: a key of :attr:`Parameters.libraries`.
+        seconds: run time of all attempts, each up to its last checkpoint.
+        resumed: how often it was resumed.
+        inputs: ids of the artefacts it was made from.
+    """
+
+    stage: str
+    about: str
+    code: tuple[Code, ...]
+    libraries: str
+    seconds: float | None
+    resumed: int | None
+    inputs: tuple[str, ...]
+
+
+class Others(msgspec.Struct, frozen=True, kw_only=True):
+    """Runs for the same cell as one in the report, made with other parameters and so left out."""
+
+    stage: str
+    about: str
+    why: str
+    ids: tuple[str, ...]
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a report on a table or figure depends on, besides its evaluations and metrics.
+
+    Attributes:
+        kind: of report, such as ``table1``.
+        command: the command line that produces this report; printed in it.
+        measures: of ``transfer``, ``zero-shot`` and ``id``.
+        runs: provenance of the artefacts, by id.
+        libraries: the sets of library versions that occur, by a short name.
+    """
+
+    kind: str
+    title: str
+    command: str
+    measures: tuple[str, ...]
+    rows: tuple[Row, ...]
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    cells: tuple[Cell, ...]
+    runs: dict[str, Run]
+    libraries: dict[str, dict[str, str | None]]
+    others: tuple[Others, ...]

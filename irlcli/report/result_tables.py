@@ -1,0 +1,278 @@
+"""The tables of a report as text: results, learned returns, comparisons, discriminators, costs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import ttest_ind_from_stats
+
+from irlcli.report import paper
+from irlcli.report.agents import BASELINES, MEASURES, title
+from irlcli.report.compute import failed_to_imitate
+from irlcli.report.lineage import commits, duration, evaluations, lineage
+from irlcli.report.parameters import Parameters, Row, Run
+from irlcli.report.tables import Table
+from irlcli.report.text import number, p_value, percent
+
+_MAIN_NOTE = (
+    "Mean true return ± standard deviation over seeds. p: Welch's test, AIRL-IRM against AIRL-ERM; "
+    "Holm: adjusted over the rows that have a p-value. (3/5): three of five seeds exist; (part): "
+    "some evaluations are missing. † not imitated in distribution. ‡ runs of more than one commit "
+    "or set of libraries. Training experts, reused: the experts of the training settings, each "
+    "evaluated where the students are, their mean: the return without learning a reward. Progress: "
+    "the part of the return earned by walking or reaching (an idle ant earns about 600 for being "
+    "alive)."
+)
+_LEARNED_NOTE = (
+    "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
+    "discounts), mean over seeds; of the policy retrained on that reward, and of the held-out "
+    "setting's expert. Short: seeds whose retrained policy has a true return more than a fifth below "
+    "the expert's. Scored higher: those of them that the reward scores above the expert, so that it "
+    "prefers a worse policy. In the others, optimisation fell short, which does not show that the "
+    "reward is right. The unit is the standard deviation of g on the training data; zero has no "
+    "meaning."
+)
+_COMPARISON_NOTE = (
+    "Two-sided p-values. Welch's test is the primary one. Paired: t-test over the seeds that both "
+    "methods have (their number in brackets), which share initialisation and starts; - where the "
+    "differences do not vary or fewer than two pairs exist. Student's test assumes equal variances; "
+    "the paper used it (its value is recomputed from its means and deviations, n = 5). P(better): "
+    "probability that a seed of the first method beats one of the second, ties count half."
+)
+_DISCRIMINATOR_NOTE = (
+    "Over the last tenth of the rounds, means over settings and seeds. Fresh: on new samples of the "
+    "current policy; the penalty is IRMv1, also for methods that do not penalise it. Optimised: "
+    "means over the training minibatches, which hold replayed episodes, of what was minimised. "
+    "Share: lambda times the optimised penalty over the optimised cross-entropy. The unbiased "
+    "estimate of the penalty may be negative. Where --select kept an earlier round, these are still "
+    "the last rounds. If the discriminator is always right, the penalty has nothing to change."
+)
+_CELL_NOTE = (
+    "95 %: percentile bootstrap interval of the mean over seeds, too narrow with few seeds. IQM: "
+    "mean of the middle half of the seeds. Expert, random and idle are one policy each; the reused "
+    "experts are one policy per training setting."
+)
+_BUDGET_NOTE = (
+    "Demonstrations: episodes per training setting. Lambda: the penalty's weight, by method and seed "
+    "where it was chosen by leaving a setting out. Round: the one that was kept."
+)
+_COST_NOTE = (
+    "Wall-clock time of one process on a machine shared with other runs. A resumed run counts each "
+    "attempt up to its last checkpoint. + marks uncommitted changes."
+)
+
+
+def measures(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[Table]:
+    """A table per measure, with the note below the first."""
+    notes = [_MAIN_NOTE] + [""] * len(p.measures)
+    return [
+        _measure(p, measure, note, cells, comparisons)
+        for measure, note in zip(p.measures, notes, strict=False)
+    ]
+
+
+def _measure(
+    p: Parameters, measure: str, note: str, cells: pd.DataFrame, comparisons: pd.DataFrame
+) -> Table:
+    """A line per row, one more for its progress, and one for the paper's numbers."""
+    baseline = "id" if measure == "id" else "ood"
+    agents = [*p.methods, "expert", "reused"]
+    agents += [] if measure == "id" else ["random", "idle"]
+    first = comparisons[(comparisons["x"] == "irm") & (comparisons["y"] == "erm")]
+    tested = {r.row: r for r in first[first["measure"] == measure].itertuples()}
+    lines = []
+    for row in p.rows:
+        own = {
+            r.agent: r
+            for r in cells[cells["row"] == row.name].itertuples()
+            if r.measure == (baseline if r.agent in BASELINES else measure)
+        }
+        values = row.trained if measure == "id" else (row.unseen,)
+        where = f"{row.name} = {', '.join(text.partition('=')[2] for text in values)}"
+        test = tested.get(row.name)
+        tests = ["-", "-"] if test is None else [p_value(test.p_welch), p_value(test.p_welch_holm)]
+        lines.append([where, "return", *(_cell(own[a]) for a in agents), *tests])
+        if any(not pd.isna(own[a].progress) for a in agents):
+            lines.append([where, "progress", *(number(own[a].progress) for a in agents), "", ""])
+        if measure == "id":
+            ratios = {a: own[a].of_expert for a in agents if a != "expert"}
+            shares = {a: "-" if r is pd.NA else f"{r:.0%}" for a, r in ratios.items()}
+            lines.append([where, "of the expert", *(shares.get(a, "") for a in agents), "", ""])
+        printed = paper_row(p, row, measure)
+        if printed is not None:
+            texts = {
+                a: f"{v.mean} ± {v.deviation}"
+                for a, v in (("erm", printed.erm), ("irm", printed.irm), ("expert", printed.expert))
+            }
+            welch = p_value(_paper_p(printed, equal_variances=False))
+            lines.append([where, "paper", *(texts.get(a, "") for a in agents), welch, ""])
+    columns = ["setting", "", *(title(a) for a in agents), "p", "Holm"]
+    return Table(MEASURES[measure], note, columns, lines, heads=2)
+
+
+def paper_row(p: Parameters, row: Row, measure: str) -> paper.Row | None:
+    """The paper's numbers for ``row``, if it printed any for this report and measure."""
+    if p.kind != "table1" or measure != "transfer":
+        return None
+    return paper.TABLE1.get((row.env, row.knob))
+
+
+def _paper_p(row: paper.Row, equal_variances: bool) -> float:
+    n = paper.SEEDS
+    test = ttest_ind_from_stats(*row.irm, n, *row.erm, n, equal_var=equal_variances)
+    return float(test.pvalue)
+
+
+def _cell(cell: Any) -> str:
+    if pd.isna(cell.mean):
+        return "-"
+    text = f"{cell.mean:.1f}"
+    if not pd.isna(cell.deviation):
+        text += f" ± {cell.deviation:.1f}"
+    if cell.seeds < cell.seeds_wanted:
+        text += f" ({cell.seeds}/{cell.seeds_wanted})"
+    elif not cell.complete:
+        text += " (part)"
+    if failed_to_imitate(cell):
+        text += " †"
+    return text + (" ‡" if cell.mixed else "")
+
+
+def learned_returns(found: pd.DataFrame) -> Table:
+    """The retrained policies and the expert, scored by the frozen rewards."""
+    lines = [
+        [
+            r.row,
+            title(r.agent),
+            str(r.seeds),
+            number(r.retrained),
+            number(r.expert),
+            f"{r.short}/{r.seeds}",
+            f"{r.short_scored_higher}/{r.short}" if r.short else "",
+        ]
+        for r in found.itertuples()
+    ]
+    columns = ["row", "method", "seeds", "retrained policy", "expert", "short", "scored higher"]
+    return Table("Learned returns", _LEARNED_NOTE, columns, lines, heads=2)
+
+
+def comparisons(found: pd.DataFrame) -> Table:
+    """The pairs of methods that both have a seed."""
+    lines = []
+    for r in found[found["difference"].notna()].itertuples():
+        printed = paper.TABLE1.get(tuple(r.row.split(" ", 1)))
+        shown = r.measure == "transfer" and (r.x, r.y) == ("irm", "erm") and printed is not None
+        remark = "not imitated: do not interpret the gap" if r.not_imitated else ""
+        lines.append(
+            [
+                r.row,
+                r.measure,
+                f"{title(r.x)} - {title(r.y)}",
+                number(r.difference),
+                p_value(r.p_welch),
+                p_value(r.p_welch_holm),
+                f"{p_value(r.p_paired)} ({r.pairs})",
+                p_value(r.p_student),
+                p_value(_paper_p(printed, equal_variances=True)) if shown else "",
+                number(r.improvement, 2),
+                r.why or remark,
+            ]
+        )
+    columns = ["row", "measure", "difference of", "means", "Welch", "Welch, Holm", "paired"]
+    columns += ["Student", "Student, paper", "P(better)", "remark"]
+    return Table("Comparisons", _COMPARISON_NOTE, columns, lines, heads=3)
+
+
+def discriminators(found: pd.DataFrame) -> Table:
+    """The discriminators at the end of training: diagnostics, and what was optimised."""
+    lines = []
+    for r in found.itertuples():
+        penalised = r.penalty_weight > 0
+        lines.append(
+            [
+                r.row,
+                title(r.agent),
+                str(r.seeds),
+                f"{r.accuracy:.1%}",
+                number(r.mean_abs_logit),
+                f"{r.cross_entropy:.3f}",
+                f"{r.penalty:.4f}",
+                f"{r.optimised_cross_entropy:.3f}",
+                f"{r.optimised_penalty:.4f}" if penalised else "",
+                percent(r.share) if penalised else "",
+            ]
+        )
+    columns = ["row", "method", "seeds", "accuracy, fresh", "mean |logit|, fresh"]
+    columns += ["cross-entropy, fresh", "IRMv1, fresh", "cross-entropy, optimised"]
+    columns += ["penalty, optimised", "share"]
+    title_ = "The discriminator at the end of training"
+    return Table(title_, _DISCRIMINATOR_NOTE, columns, lines, heads=2)
+
+
+def cells(found: pd.DataFrame) -> Table:
+    """Every cell with its statistics."""
+    lines = [
+        [
+            r.row,
+            title(r.agent),
+            r.measure,
+            f"{r.seeds}/{r.seeds_wanted}",
+            number(r.mean),
+            number(r.deviation),
+            "-" if pd.isna(r.low) else f"[{r.low:.1f}, {r.high:.1f}]",
+            number(r.iqm),
+            number(r.progress),
+        ]
+        for r in found.itertuples()
+    ]
+    columns = ["row", "agent", "measure", "seeds", "mean", "sd", "95 %", "IQM", "progress"]
+    return Table("Every cell", _CELL_NOTE, columns, lines, heads=3)
+
+
+def budgets(p: Parameters) -> Table:
+    """How long each stage trains, and on how much."""
+    lines = []
+    for row in p.rows:
+        config = row.config
+        lines.append(
+            [
+                row.name,
+                f"{config['expert']['total_steps']:,}",
+                ", ".join(map(str, row.demonstrations)),
+                f"{config['airl']['total_steps']:,}",
+                ", ".join(f"{run}: {weight:g}" for run, weight in row.chosen.items())
+                or f"{config['airl']['penalty_weight']:g}",
+                config["airl"]["select"],
+                f"{config['transfer']['total_steps']:,}" if "transfer" in p.measures else "-",
+                str(config["evaluation"]["episodes"]),
+            ]
+        )
+    columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda", "round"]
+    columns += ["transfer steps", "evaluation episodes"]
+    return Table("Budgets", _BUDGET_NOTE, columns, lines)
+
+
+def costs(p: Parameters) -> Table:
+    """How long the runs behind each row took, by stage."""
+    lines = []
+    for row in p.rows:
+        stages: dict[str, list[Run]] = {}
+        for id16 in lineage(p, evaluations(c for c in p.cells if c.row == row.name)):
+            stages.setdefault(p.runs[id16].stage, []).append(p.runs[id16])
+        for stage, runs in sorted(stages.items()):
+            seconds = [r.seconds for r in runs if r.seconds is not None]
+            lines.append(
+                [
+                    row.name,
+                    stage,
+                    str(len(runs)),
+                    duration(float(np.median(seconds))) if seconds else "-",
+                    duration(sum(seconds)) if seconds else "-",
+                    str(sum(1 for r in runs if r.resumed)),
+                    ", ".join(commits(runs)),
+                ]
+            )
+    columns = ["row", "stage", "runs", "median time", "total time", "resumed", "commits"]
+    return Table("Cost", _COST_NOTE, columns, lines, heads=2)

@@ -1,0 +1,96 @@
+"""A table or figure of the paper from evaluations: numbers, statistics, plots, and one page.
+
+Its inputs are evaluations and metrics, known by their content. What else it prints (which run took
+how long, at which commit) are parameters, so that equal requests give equal bytes.
+"""
+
+from collections.abc import Mapping
+
+from irlcli.report.parameters import (
+    EXPERT_BY_REWARD,
+    Cell,
+    Code,
+    Others,
+    Parameters,
+    Row,
+    Run,
+)
+from irlcli.stages.base import Job, Request, Source, Stage
+
+__all__ = ["Cell", "Code", "Others", "Parameters", "Row", "Run", "STAGE", "request"]
+
+
+def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
+    """The report on ``sources``: evaluations by :attr:`Cell.role`, and ``metrics.parquet`` files.
+
+    The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. Outputs
+    ``README.md``, ``KIND.csv`` (a row per cell), ``seeds.csv`` (a row per seed and setting),
+    ``comparisons.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``.
+    """
+    return Request(STAGE, parameters, dict(sources), f"report {parameters.kind}")
+
+
+def run(job: Job) -> None:
+    """Read the evaluations, compute the statistics, lay them out."""
+    import pandas as pd
+
+    from irlcli.data import descriptions
+    from irlcli.data.outputs import write_json
+    from irlcli.report import build, page, plots
+    from irlcli.store import read_json
+
+    p: Parameters = job.parameters
+    points, episodes = [], {}
+    for cell in p.cells:
+        if not cell.run:
+            continue
+        directory = job.inputs[cell.role]
+        path = directory / "summary.json"
+        summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
+        of_expert = cell.agent in ("expert", "reused") or cell.measure == EXPERT_BY_REWARD
+        points += [
+            {
+                "row": cell.row,
+                "agent": cell.agent,
+                "measure": cell.measure,
+                "seed": cell.seed,
+                "expert_of": cell.place if of_expert else "",
+                "setting": place.setting,
+                "true_return": place.mean_return,
+                "progress": place.mean_progress,
+                "learned_return": place.mean_learned_return,
+                "episodes": place.episodes,
+                "evaluation": cell.run,
+            }
+            for place in summary.settings
+        ]
+        if cell.seed is not None and cell.measure in p.measures:
+            returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
+            group = episodes.setdefault((cell.row, cell.measure), {})
+            group[cell.agent, cell.seed] = returns["true_return"].to_numpy()
+    learning = {
+        role: pd.read_parquet(path)
+        for role, path in job.inputs.items()
+        if role.endswith("-learning")
+    }
+    rewards = {
+        (row.name, method, seed): learning[role]
+        for row in p.rows
+        for method in p.methods
+        for seed in p.seeds
+        if (role := f"{row.name} {method} {seed} reward-learning") in learning
+    }
+    report = build.build(p, pd.DataFrame(points), episodes, rewards)
+    report.cells.to_csv(job.output / f"{p.kind}.csv", **_CSV)
+    report.points.to_csv(job.output / "seeds.csv", **_CSV)
+    report.comparisons.to_csv(job.output / "comparisons.csv", **_CSV)
+    write_json(job.output / f"{p.kind}.json", build.as_json(report))
+    (job.output / "README.md").write_text(page.markdown(p, report))
+    (job.output / f"{p.kind}.tex").write_text(page.latex(report))
+    points_svg = plots.draw_points(job.output, p, report)
+    curves = plots.learning_curves(p, learning)
+    (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, curves))
+
+
+_CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
+STAGE = Stage("report", 9, run)

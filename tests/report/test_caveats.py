@@ -1,0 +1,141 @@
+"""Everything that a reader must know before drawing conclusions is in the caveats."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from report_examples import (
+    BOUNCE,
+    POWER,
+    cell,
+    complete,
+    example,
+    metrics,
+    run_of,
+    scored,
+    table,
+)
+
+from irlcli.report.build import build
+from irlcli.report.parameters import Others
+
+
+def test_a_complete_table_has_no_caveats():
+    assert build(*example(complete()), {}, {}).caveats == []
+
+
+def test_a_student_that_did_not_imitate():
+    found = build(*example(complete(student=199.0)), {}, {}).caveats
+    (marked,) = (c for c in found if c.startswith(f"Not imitated: {BOUNCE}, AIRL-ERM"))
+    assert "80% of the expert (79.6% of the expert's return)" in marked
+
+
+def test_a_saturated_discriminator():
+    learning = {
+        (BOUNCE, "irm", 0): metrics(0.94, 0.001, 8.0),
+        (BOUNCE, "irm", 1): metrics(0.98, 0.004, 0.5),
+        (BOUNCE, "erm", 0): metrics(0.99, 0.0, 0.0),
+        (POWER, "irm", 0): metrics(0.60, 0.5, 4.0),
+    }
+    (caveat,) = build(*example(complete()), {}, learning).caveats
+    assert caveat.startswith(f"Saturated: {BOUNCE}, AIRL-IRM: ")
+    assert "96.0% of fresh samples" in caveat
+    assert "2.5% of the optimised cross-entropy" in caveat
+
+
+def test_a_saturated_discriminator_without_cross_entropy():
+    certain = metrics(1.0, -0.0001, 4.0).assign(optimised_cross_entropy=0.0)
+    (caveat,) = build(*example(complete()), {}, {(BOUNCE, "irm", 0): certain}).caveats
+    assert "penalty is - of the optimised cross-entropy" in caveat
+
+
+def test_a_wrong_reward_and_a_failed_optimisation_are_told_apart():
+    pairs = {
+        (BOUNCE, "erm"): [(4, 1), (5, 1), (9, 10)],
+        (BOUNCE, "irm"): [(1, 2), (1, 1), (1, 2)],
+    }
+    erm, irm = (c for c in scored(pairs).caveats if c.startswith("Short of the expert"))
+    assert erm.startswith(f"Short of the expert: {BOUNCE}, AIRL-ERM: 3 of 3 retrained policies. ")
+    assert "scores 2 of them above the expert" in erm
+    assert "does not score 1 of them above the expert, so optimisation fell short" in erm
+    assert irm.startswith(f"Short of the expert: {BOUNCE}, AIRL-IRM: 3 of 3 retrained policies. ")
+    assert "prefers a worse policy" not in irm
+    assert "does not score 3 of them above the expert" in irm
+
+
+def test_missing_evaluations_and_tests():
+    values = complete()
+    values[BOUNCE, "irm", "transfer"] = [5.0, None, None]
+    values[POWER, "irm", "transfer"] = [None] * 3
+    found = build(*example(values), {}, {}).caveats
+    (bounce,) = (c for c in found if c.startswith(f"Missing: {BOUNCE}: 24 of 26"))
+    assert "train-airl has not run: AIRL-IRM 1, 2." in bounce
+    assert any(c.startswith(f"No p-value: {BOUNCE}: 1 of 3") for c in found)
+
+
+def test_runs_that_are_bitwise_equal():
+    same = {("irm", s): np.array([1.0, 2.0 + (s == 2)]) for s in range(3)}
+    (caveat,) = build(*example(complete()), {(BOUNCE, "transfer"): same}, {}).caveats
+    assert caveat.startswith(f"Identical: {BOUNCE}, transfer: AIRL-IRM seed 0, AIRL-IRM seed 1 ")
+    assert "seed 2" not in caveat
+    methods = {("irm", 0): same["irm", 0], ("erm", 0): same["irm", 0]}
+    (caveat,) = build(*example(complete()), {(BOUNCE, "id"): methods}, {}).caveats
+    assert "AIRL-IRM seed 0, AIRL-ERM seed 0 have bitwise equal returns" in caveat
+
+
+def with_demonstrations(sets):
+    """The parameters of :func:`complete`; a row's seed k learns from ``sets[row][k]``."""
+    p, points = example(complete())
+    runs = dict(p.runs)
+    for c in p.cells:
+        if c.row in sets and c.seed is not None:
+            demos = sets[c.row][c.seed]
+            runs[c.run] = run_of(1, inputs=(demos,))
+            runs[demos] = run_of(2, "collect-experts")
+    return replace(p, runs=runs), points
+
+
+def test_seeds_that_share_demonstrations_do_not_vary_them():
+    """Of the two rows, one has a set of demonstrations for each seed."""
+    sets = {BOUNCE: ["shared"] * 3, POWER: ["a", "b", "c"]}
+    (caveat,) = build(*with_demonstrations(sets), {}, {}).caveats
+    assert caveat.startswith(f"Shared demonstrations: {BOUNCE}: all seeds and methods")
+    assert "one expert per setting" in caveat
+    both = build(*with_demonstrations(dict.fromkeys((BOUNCE, POWER), ["shared"] * 3)), {}, {})
+    (caveat,) = both.caveats
+    assert caveat.startswith(f"Shared demonstrations: {BOUNCE}, {POWER}: ")
+
+
+def test_another_commit_far_behind_a_cell_marks_it():
+    p, points = example(complete())
+    (target,) = (
+        c for c in p.cells if (c.row, c.agent, c.measure, c.seed) == (BOUNCE, "irm", "transfer", 2)
+    )
+    runs = {
+        **p.runs,
+        target.run: run_of(2, inputs=("parent",)),
+        "parent": run_of(1, inputs=("expert",)),
+        "expert": run_of(0, commit="0ld"),
+    }
+    report = build(replace(p, runs=runs), points, {}, {})
+    assert cell(report, BOUNCE, "irm", "transfer")["mixed"]
+    assert not cell(report, BOUNCE, "erm", "transfer")["mixed"]
+    assert table(report, "Transfer").rows[0][3].endswith("‡")
+    (caveat,) = report.caveats
+    assert caveat.startswith(f"Mixed: {BOUNCE}") and "commit 0ld" in caveat
+
+
+@pytest.mark.parametrize(
+    ("other", "shown"),
+    [({"dirty": "abc"}, "with changes abc"), ({"libraries": "newer"}, "libraries newer: 1 run")],
+)
+def test_changes_and_other_libraries_count_as_mixed(other, shown):
+    p, points = example(complete())
+    runs = {**p.runs, p.cells[0].run: run_of(0, **other)}
+    (caveat,) = build(replace(p, runs=runs), points, {}, {}).caveats
+    assert caveat.startswith("Mixed: ") and shown in caveat
+
+
+def test_runs_with_other_parameters_are_counted_and_named():
+    others = Others(stage="train-airl", about="x irm", why="seed 1 instead of 0", ids=("aa", "bb"))
+    (caveat,) = build(*example(complete(), others=(others,)), {}, {}).caveats
+    assert caveat == "Left out: 2 runs of train-airl, x irm (aa, bb): seed 1 instead of 0."

@@ -1,0 +1,172 @@
+"""A report's numbers, from evaluations made up here."""
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+from report_examples import (
+    BOUNCE,
+    CONFIG,
+    POWER,
+    cell,
+    complete,
+    example,
+    metrics,
+    scored,
+    table,
+)
+
+from irlcli.configs import Config
+from irlcli.report.agents import comparisons
+from irlcli.report.build import build
+from irlcli.report.compute import imitates
+from irlcli.report.parameters import EXPERT_BY_REWARD
+
+
+def test_cells_are_means_over_seeds():
+    report = build(*example(complete()), {}, {})
+    found = cell(report, BOUNCE, "irm", "transfer")
+    assert (found["mean"], found["seeds"], found["seeds_wanted"]) == (4.0, 3, 3)
+    assert found["deviation"] == pytest.approx(7**0.5)
+
+
+def test_methods_are_compared_row_by_row():
+    report = build(*example(complete()), {}, {})
+    first = report.comparisons.iloc[0]
+    assert (first["row"], first["x"], first["y"]) == (BOUNCE, "irm", "erm")
+    assert first["difference"] == 2.0
+    # Two rows with the same p: Holm doubles it.
+    assert first["p_welch_holm"] == pytest.approx(2 * first["p_welch"])
+    assert first["improvement"] == pytest.approx((1.5 + 2.5 + 3) / 9)
+
+
+def test_the_paired_test_uses_the_seeds_that_both_methods_have():
+    values = complete()
+    # Seeds 1 and 2 are common; their differences are 2 and 4: t = 3 with one degree of freedom.
+    values[BOUNCE, "erm", "transfer"] = [None, 1.0, 5.0]
+    values[BOUNCE, "irm", "transfer"] = [-100.0, 3.0, 9.0]
+    report = build(*example(values), {}, {})
+    first = report.comparisons.iloc[0]
+    assert first["pairs"] == 2
+    assert first["p_paired"] == pytest.approx(1 - 2 * np.arctan(3) / np.pi)
+    shown = table(report, "Comparisons")
+    assert shown.rows[0][shown.columns.index("paired")] == "0.205 (2)"
+
+
+def test_methods_that_seek_invariance_are_compared_with_all_others():
+    methods = ("erm", "irm", "erm-balanced", "irm-shuffled", "mine")
+    controls = ("erm", "erm-balanced", "irm-shuffled", "mine")
+    assert comparisons(methods) == [("irm", control) for control in controls]
+    assert comparisons(("erm", "erm-balanced")) == []
+
+
+def test_reused_experts_are_one_number_and_no_sample():
+    report = build(*example(complete()), {}, {})
+    unseen, trained = (cell(report, BOUNCE, "reused", m) for m in ("ood", "id"))
+    assert (unseen["mean"], unseen["seeds"], unseen["seeds_wanted"]) == (110.0, 1, 1)
+    assert pd.isna(unseen["deviation"]) and pd.isna(unseen["of_expert"])
+    assert (trained["mean"], trained["of_expert"]) == (250.0, 1.0)
+    assert trained["imitated"] is pd.NA
+    partly = complete() | {(BOUNCE, "reused", "id"): [200.0, None]}
+    assert cell(build(*example(partly), {}, {}), BOUNCE, "reused", "id")["of_expert"] is pd.NA
+
+
+@pytest.mark.parametrize(
+    ("student", "expert", "expected"),
+    [
+        *((80.0, 100.0, True), (79.9, 100.0, False), (-11.9, -10.0, True), (-12.1, -10.0, False)),
+        *((None, 1.0, None), (1.0, None, None), (0.0, 0.0, True)),
+    ],
+)
+def test_imitation_is_within_a_fifth_of_the_expert(student, expert, expected):
+    assert imitates(student, expert) is expected
+
+
+def test_a_student_below_the_bar_has_not_imitated():
+    report = build(*example(complete(student=199.0)), {}, {})
+    assert not cell(report, BOUNCE, "erm", "id")["imitated"]
+    assert cell(report, BOUNCE, "irm", "id")["imitated"]
+    assert cell(report, BOUNCE, "erm", "id")["of_expert"] == pytest.approx(0.796)
+    assert set(report.comparisons["not_imitated"]) == {"erm"}
+
+
+def test_learned_returns_rank_policy_and_expert():
+    pairs = {
+        (BOUNCE, "erm"): [(4, 1), (5, 1), (9, 10)],
+        (BOUNCE, "irm"): [(1, 2), (1, 1), (1, 2)],
+    }
+    report = scored(pairs)
+    assert report.learned_returns.to_dict("records") == [
+        {
+            **{"row": BOUNCE, "agent": agent, "seeds": 3, "retrained": policy, "expert": expert},
+            **{"short": 3, "short_scored_higher": higher},
+        }
+        for agent, policy, expert, higher in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 0))
+    ]
+    # The expert's returns under the rewards are in no cell.
+    assert set(report.cells["measure"]) == {"ood", "id", "transfer", "zero-shot"}
+
+
+@pytest.mark.parametrize(("returns", "short"), [([240.0, 250.0, 260.0], 0), ([280.0, 0.0, 0.0], 2)])
+def test_only_policies_that_fall_short_count_as_scored_higher(returns, short):
+    values = complete() | {(BOUNCE, "erm", "transfer"): returns}
+    values[BOUNCE, "erm", EXPERT_BY_REWARD] = [250.0] * 3
+    p, points = example(values)
+    # The reward scores seed 0 higher, which does not fall short in either case.
+    higher = (points["measure"] == "transfer") & (points["seed"] == 0)
+    points["learned_return"] = higher.astype(float)
+    report = build(p, points, {}, {})
+    (found,) = report.learned_returns.itertuples()
+    assert (found.agent, found.short, found.short_scored_higher) == ("erm", short, 0)
+    assert any(c.startswith("Short of") for c in report.caveats) == (short > 0)
+
+
+def test_learned_returns_need_both_evaluations_of_a_seed():
+    values = complete()
+    values[BOUNCE, "erm", EXPERT_BY_REWARD] = [250.0, None, 250.0]
+    p, points = example(values)
+    points["learned_return"] = 2.0
+    points.loc[(points["measure"] == "transfer") & (points["seed"] == 0), "learned_return"] = None
+    found = build(p, points, {}, {}).learned_returns
+    assert [(r.agent, r.seeds) for r in found.itertuples()] == [("erm", 1)]
+
+
+def test_the_penaltys_share_is_of_what_was_optimised():
+    learning = {
+        # Fresh samples have a penalty of 0.5 and a cross-entropy of 0.4 (0.3 and 0.5).
+        (BOUNCE, "irm", 0): metrics(0.94, 0.001, 8.0),
+        (BOUNCE, "irm", 1): metrics(0.98, 0.004, 0.5),
+        (BOUNCE, "erm", 0): metrics(0.99, 0.0, 0.0),
+    }
+    found = build(*example(complete()), {}, learning).discriminators.set_index("agent")
+    # (8 * 0.001 + 0.5 * 0.004) / 2 of 0.2, not the product of the means.
+    assert found.loc["irm", "share"] == pytest.approx(0.025)
+    assert found.loc["irm", "optimised_penalty"] == pytest.approx(0.0025)
+    assert found.loc["irm", "optimised_cross_entropy"] == pytest.approx(0.2)
+    assert found.loc["irm", ["penalty", "cross_entropy"]].tolist() == pytest.approx([0.5, 0.4])
+    assert found.loc["irm", "accuracy"] == pytest.approx(0.96)
+    assert (found.loc["erm", "share"], found.loc["irm", "seeds"]) == (0.0, 2)
+
+
+def test_a_share_of_a_zero_cross_entropy_is_missing():
+    certain = metrics(1.0, -0.0001, 4.0).assign(optimised_cross_entropy=0.0)
+    report = build(*example(complete()), {}, {(BOUNCE, "irm", 0): certain})
+    (found,) = report.discriminators.itertuples()
+    assert pd.isna(found.share)
+
+
+def test_seeds_are_missing_from_cells_and_tests():
+    values = complete()
+    values[BOUNCE, "irm", "transfer"] = [5.0, None, None]
+    values[POWER, "irm", "transfer"] = [None] * 3
+    report = build(*example(values), {}, {})
+    c = report.comparisons[report.comparisons["measure"] == "transfer"]
+    assert c[["p_welch", "p_welch_holm", "p_paired"]].isna().all(axis=None)
+    assert c["pairs"].tolist() == [1, 0]
+    assert "one seed" in c.iloc[0]["why"] and "no seed" in c.iloc[1]["why"]
+
+
+def test_the_configs_of_the_rows_are_those_that_the_budgets_read():
+    tree = msgspec.to_builtins(Config())
+    for stage, values in CONFIG.items():
+        assert set(values) <= set(tree[stage])

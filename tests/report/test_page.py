@@ -1,0 +1,127 @@
+"""A report as HTML, Markdown and LaTeX, and its plots."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import pandas as pd
+import pytest
+from msgspec.structs import replace
+from report_examples import BOUNCE, complete, example, metrics, run_of
+
+from irlcli.report import page, plots
+from irlcli.report.build import as_json, build
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and collects attributes and text."""
+
+    VOID = frozenset({"meta", "br", "img", "link"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.attributes, self.text = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes += [(tag, *a) for a in attributes]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.attributes += [(tag, *a) for a in attributes]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def parsed(html):
+    tags = Tags()
+    tags.feed(html)
+    assert tags.open == []
+    return tags
+
+
+def test_the_page_is_well_formed_and_self_contained():
+    p, points = example(complete())
+    p = replace(p, title="<script>alert(1)</script> & co")
+    report = build(p, points, {}, {})
+    html = page.html(p, report, "<svg><g/></svg>", {"curves": "<svg></svg>"})
+    tags = parsed(html)
+    assert not [a for a in tags.attributes if a[0] == "script" or a[1] in ("src", "onload")]
+    links = [value for _, name, value in tags.attributes if name == "href"]
+    ids = {value for _, name, value in tags.attributes if name == "id"}
+    assert links and all(link.startswith("#") and link[1:] in ids for link in links)
+    assert not re.search(r"url\(|@import|http", html)
+    text = "".join(tags.text)
+    assert "<script>alert(1)</script> & co" in text
+    for wanted in ("156.8 ± 53.1", "4.0 ± 2.6", p.cells[0].run, "c0ffee"):
+        assert wanted in text
+    assert "prefers-color-scheme: dark" in html and "@media print" in html
+
+
+def test_caveats_are_in_every_format():
+    p, points = example(complete() | {(BOUNCE, "irm", "transfer"): [5.0, None, None]})
+    report = build(p, points, {}, {})
+    html = "".join(parsed(page.html(p, report, "<svg/>", {})).text)
+    assert report.caveats
+    for caveat in report.caveats:
+        assert all(caveat in text for text in (html, page.markdown(p, report), page.latex(report)))
+    assert as_json(report)["caveats"] == report.caveats
+
+
+def test_json_has_no_nan():
+    values = complete() | {(BOUNCE, "irm", "transfer"): [5.0, None, None]}
+    learning = {(BOUNCE, "irm", 0): metrics(1.0, 0.1, 4.0).assign(optimised_cross_entropy=0.0)}
+    found = as_json(build(*example(values), {}, learning))
+    assert json.loads(json.dumps(found, allow_nan=False))["discriminators"][0]["share"] is None
+
+
+def test_only_runs_behind_a_number_are_counted():
+    p, points = example(complete())
+
+    def counted(p):
+        text = page.markdown(p, build(p, points, {}, {}))
+        return re.search(r"from \d+ runs that took \S+,", text)[0]
+
+    assert counted(p).startswith(f"from {len(p.runs)} runs")
+    assert counted(replace(p, runs=p.runs | {"e" * 16: run_of(0)})) == counted(p)
+
+
+def test_markdown_tables_are_rectangular():
+    p, points = example(complete())
+    report = build(p, points, {}, {})
+    blocks = re.findall(r"(?:^\|.*\|\n)+", page.markdown(p, report), re.MULTILINE)
+    assert len(blocks) == len(report.tables)
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+
+
+@pytest.mark.parametrize("method", ["irm", "mine"])
+def test_every_seed_is_plotted(tmp_path, method):
+    """``mine`` is in no table of methods."""
+    values = complete() | {(BOUNCE, method, "transfer"): [1.0, 2.0, 4.0]}
+    p, points = example(values, methods=("erm", method))
+    svg = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
+    assert parsed(svg) and svg.startswith("<svg")
+    assert (tmp_path / "table1.png").stat().st_size and (tmp_path / "table1.pdf").stat().st_size
+    again = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
+    assert again == svg
+
+
+def test_learning_curves_have_a_plot_per_row_and_kind():
+    p, _ = example(complete())
+    recorded = metrics(0.9, 0.1, 1.0)
+    curve = recorded.assign(
+        steps=recorded["round"] * 1000, true_return=recorded["round"], progress=float("nan")
+    )
+    learning = {f"{BOUNCE} {method} 0 reward-learning": curve for method in p.methods}
+    learning[f"{BOUNCE} irm 0 transfer-learning"] = pd.DataFrame(
+        {"setting": "a", "steps": [0, 1000], "true_return": [1.0, 2.0]}
+    )
+    found = plots.learning_curves(p, learning)
+    assert [title.partition(", ")[0] for title in found] == [BOUNCE, BOUNCE]
+    for svg in found.values():
+        parsed(svg)
