@@ -1,5 +1,6 @@
 """Content-addressed artefacts: digests, manifests, publishing, references, collection."""
 
+from irlcli.store.artefact import Artefact, Published
 from irlcli.store.digest import canonical_json, digest, file_digest
 from irlcli.store.index import Index
 from irlcli.store.manifest import (
@@ -10,8 +11,10 @@ from irlcli.store.manifest import (
     directory_outputs,
     read_json,
 )
+from irlcli.store.read import Peek
+from irlcli.store.references import Resolved
 from irlcli.store.scratch import Scratch
-from irlcli.store.store import Artefact, Published, Resolved, Store
+from irlcli.store.store import Store
 
 __all__ = [
     "Artefact",
@@ -19,6 +22,7 @@ __all__ = [
     "KeyRecord",
     "Manifest",
     "Output",
+    "Peek",
     "Published",
     "Resolved",
     "Scratch",

@@ -1,4 +1,4 @@
-"""Canonical bytes and their sha256: what keys and ids are made of."""
+"""Canonical JSON and sha256 digests, from which keys and ids are computed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _CHUNK = 1 << 20
 
 
 def canonical_json(value: Any) -> bytes:
-    """The one byte string that stands for ``value``: sorted keys, no spaces, ASCII.
+    """The canonical encoding of ``value``: sorted keys, no spaces, ASCII.
 
     Raises:
-        ValueError: NaN or infinity anywhere (they equal nothing, so no key may hold them).
+        ValueError: NaN or infinity anywhere (NaN equals nothing, so a key with it never matches).
         TypeError: anything but dict with string keys, list, tuple, str, int, float, bool, None.
     """
     _check(value, "$")
@@ -37,10 +37,10 @@ def _check(value: Any, where: str) -> None:
     elif kind is dict:
         for key, item in value.items():
             if type(key) is not str:
-                raise TypeError(f"{where} has the key {key!r}, which is no string")
+                raise TypeError(f"{where} has the key {key!r}, which is not a string")
             _check(item, f"{where}.{key}")
     else:
-        raise TypeError(f"{where} is a {type(value).__name__}, which has no canonical form")
+        raise TypeError(f"{where} is a {type(value).__name__}, which has no canonical encoding")
 
 
 def digest(value: Any) -> str:
@@ -49,7 +49,7 @@ def digest(value: Any) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """sha256 of a file's bytes, read in pieces.
+    """sha256 of a file's bytes, read in chunks.
 
     Raises:
         OSError: the file cannot be read.

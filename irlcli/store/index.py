@@ -1,4 +1,4 @@
-"""What leads to what, from all manifests read once."""
+"""Which artefacts were made from which, from all manifests read once."""
 
 from __future__ import annotations
 
@@ -7,46 +7,46 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from irlcli.store.store import Artefact
+    from irlcli.store.artefact import Artefact
 
 
 class Index:
     """The artefacts of a store at one moment, by id.
 
     Args:
-        artefacts: those whose manifest is sound.
-        newer: the manifests, as bytes, that only a newer version can read.
+        artefacts: artefacts with sound manifests, by id.
+        newer: manifests of a newer schema, as bytes, by id.
     """
 
     def __init__(self, artefacts: Mapping[str, Artefact], newer: Mapping[str, bytes]):
         self.artefacts = dict(artefacts)
         self.newer = dict(newer)
-        self._sources: dict[str, list[str]] = {}
+        self._holders: dict[str, list[str]] = {}
         for artefact in self.artefacts.values():
             contents = {o.sha256 for o in artefact.manifest.outputs} | {artefact.manifest.content}
             for sha in contents:
-                self._sources.setdefault(sha, []).append(artefact.id)
+                self._holders.setdefault(sha, []).append(artefact.id)
 
     def parents(self, artefact: Artefact) -> dict[str, list[Artefact]]:
-        """For each input role of ``artefact``, the artefacts that hold that content."""
+        """For each input role of ``artefact``, the artefacts with that content."""
         return {role: self.holders(sha) for role, sha in artefact.manifest.record.inputs.items()}
 
     def holders(self, sha: str) -> list[Artefact]:
-        """The artefacts that hold the content ``sha``."""
-        return [self.artefacts[id16] for id16 in self._sources.get(sha, [])]
+        """The artefacts with an output, or all outputs together, of the content ``sha``."""
+        return [self.artefacts[id16] for id16 in self._holders.get(sha, [])]
 
     def reached_from(self, ids: Iterable[str]) -> set[str]:
-        """The artefacts ``ids``, their ancestors, and those of artefacts of a newer schema."""
+        """The artefacts ``ids`` and all artefacts of a newer schema, with their ancestors."""
         reached: set[str] = set()
         pending = [id16 for id16 in ids if id16 in self.artefacts]
         for manifest in self.newer.values():
-            # Its form is unknown, but content is named by sha256: whatever it mentions is kept.
+            # The schema is unknown, but content is named by sha256: keep whatever is mentioned.
             for sha in re.findall(rb"[0-9a-f]{64}", manifest):
-                pending += self._sources.get(sha.decode(), [])
+                pending += self._holders.get(sha.decode(), [])
         while pending:
             id16 = pending.pop()
             if id16 not in reached:
                 reached.add(id16)
                 for sha in self.artefacts[id16].manifest.record.inputs.values():
-                    pending += self._sources.get(sha, [])
+                    pending += self._holders.get(sha, [])
         return reached

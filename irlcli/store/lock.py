@@ -1,4 +1,4 @@
-"""Advisory file locks (flock). They only save work; correctness is the publish protocol's."""
+"""Advisory file locks (flock). They only avoid duplicate work; publishing is safe without them."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ def locked(
     shared: bool = False,
     wait: bool = False,
     on_wait: Callable[[str], None] | None = None,
-    what: str = "this",
+    what: str = "the same artefact",
 ) -> Iterator[None]:
-    """Hold ``path`` locked; the kernel releases it however the process ends.
+    """Hold a lock on ``path``. The kernel releases it however the process ends.
 
     Args:
-        path: lock file, created if absent and never removed while it could be held.
-        shared: several holders may share it.
+        path: lock file, created if absent.
+        shared: allow several holders.
         wait: wait for the present holder instead of raising.
-        on_wait: told once, with the holder's description, before waiting.
-        what: what it stands for, in an error's words.
+        on_wait: called once with a description of the holder before waiting.
+        what: what is locked, for the error message.
 
     Raises:
         Busy: held by another process and ``wait`` is false.
     """
-    # A shared lock needs no write permission: a store that may only be read can be read safely.
+    # A shared lock needs no write permission, so readers of a read-only store can take it.
     access = os.O_RDONLY if shared else os.O_RDWR
     descriptor = os.open(path, access | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
@@ -43,7 +43,7 @@ def locked(
             holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
             holder = holder or "another process"
             if not wait:
-                raise Busy(f"{holder} is at work on {what} already", "try again later") from None
+                raise Busy(f"{holder} is working on {what}", "try again later") from None
             if on_wait is not None:
                 on_wait(holder)
             fcntl.flock(descriptor, mode)
@@ -56,11 +56,11 @@ def locked(
 
 
 def is_locked(path: Path) -> bool:
-    """Whether some process holds ``path`` exclusively now."""
+    """Whether a process holds ``path`` exclusively."""
     if not path.exists():
         return False
     try:
-        # Shared: a probe must neither look like a holder nor write itself down as one.
+        # A shared lock: the probe must not be mistaken for a holder, nor write its name.
         with locked(path, shared=True):
             return False
     except Busy:

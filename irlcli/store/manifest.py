@@ -1,8 +1,8 @@
-"""What an artefact says of itself: key record, outputs, and where it came from.
+"""The two JSON files of an artefact.
 
-``manifest.json`` is hashed: its content follows from the key record and the outputs, and the
-artefact's id is their digest. ``provenance.json`` holds what may differ between equal runs
-(command line, versions, timings); it carries its own checksum and the id it belongs to.
+``manifest.json`` contains the key record and the outputs; the artefact's id is their digest.
+``provenance.json`` contains what may differ between equal runs (command line, versions, timings);
+it carries its own checksum and the artefact's id.
 """
 
 import json
@@ -19,14 +19,14 @@ SCHEMA = 1
 MANIFEST = "manifest.json"
 PROVENANCE = "provenance.json"
 _SHA = r"[0-9a-f]{64}"
-# Far above any real one; a larger file is an attack or an accident, and is not parsed.
+# Far larger than real files; anything larger is an accident or an attack.
 _MAX_JSON_BYTES = 16 << 20
-# What every file system allows, so that checking a path never fails for its length.
+# Every file system allows this, so checking a path never fails because of its length.
 _MAX_PATH_BYTES = 200
 
 
 class KeyRecord(NamedTuple):
-    """Everything that determines a result. ``inputs`` maps a role to the content's sha256."""
+    """Everything that determines a result. ``inputs`` maps roles to the sha256 of the content."""
 
     stage: str
     stage_version: int
@@ -57,14 +57,14 @@ class Output(NamedTuple):
 
 
 class Manifest(NamedTuple):
-    """A key record and the outputs it led to."""
+    """A key record and the outputs of its run."""
 
     record: KeyRecord
     outputs: tuple[Output, ...]
 
     @property
     def content(self) -> str:
-        """sha256 of the outputs alone: what a stage that reads the whole artefact depends on."""
+        """sha256 of the outputs alone: the input of stages that read the whole artefact."""
         return content_digest(self.outputs)
 
     @property
@@ -86,16 +86,16 @@ def _as_json(outputs: Iterable[Output]) -> list[dict[str, Any]]:
 
 
 def content_digest(outputs: Iterable[Output]) -> str:
-    """sha256 of a set of files, whatever made them and wherever they lie."""
+    """sha256 of a set of files, independent of their directory."""
     return digest(_as_json(outputs))
 
 
 def directory_outputs(directory: Path) -> tuple[Output, ...]:
-    """The files below ``directory`` as outputs, an artefact's own two left out.
+    """The files below ``directory`` as outputs, without manifest and provenance.
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: something that is no plain file.
+        ValueError: there is something other than plain files.
     """
     found = []
     for path in sorted(p for p in directory.rglob("*") if p.is_symlink() or not p.is_dir()):
@@ -112,7 +112,7 @@ def read_json(path: Path) -> Any:
     """A JSON document of at most 16 MiB from a regular file.
 
     Raises:
-        IntegrityError: absent, not a regular file, too large, not JSON, or nested too deeply.
+        IntegrityError: missing, not a regular file, too large, not JSON, or nested too deeply.
     """
     try:
         if path.is_symlink() or not path.is_file():
@@ -131,7 +131,7 @@ def read_manifest(directory: Path) -> Manifest:
 
     Raises:
         IntegrityError: unreadable, malformed, or altered in any byte.
-        NewerFormat: of a newer schema.
+        NewerFormat: the schema is newer than this version supports.
     """
     path = directory / MANIFEST
     value = read_json(path)
@@ -146,7 +146,7 @@ def read_manifest(directory: Path) -> Manifest:
     except OSError as error:
         raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
     if not canonical:
-        raise IntegrityError(f"{path} was altered: it says the same in other bytes")
+        raise IntegrityError(f"{path} was altered: it is not in canonical form")
     return manifest
 
 
@@ -159,18 +159,18 @@ def _parse_manifest(value: Any) -> Manifest:
     if not isinstance(value["stage"], str) or type(value["stage_version"]) is not int:
         raise ValueError("stage or stage_version has the wrong type")
     if not value["stage"].isprintable():
-        raise ValueError("stage holds unprintable characters")
+        raise ValueError("stage contains unprintable characters")
     if not isinstance(value["parameters"], dict) or not isinstance(value["inputs"], dict):
-        raise ValueError("parameters or inputs is no object")
+        raise ValueError("parameters or inputs is not an object")
     for role, sha in value["inputs"].items():
         if not isinstance(sha, str) or not re.fullmatch(_SHA, sha):
-            raise ValueError(f"input {role!r} is no sha256")
+            raise ValueError(f"input {role!r} is not a sha256")
     outputs = []
     if not isinstance(value["outputs"], list):
-        raise ValueError("outputs is no list")
+        raise ValueError("outputs is not a list")
     for item in value["outputs"]:
         if set(item) != {"path", "size", "sha256"}:
-            raise ValueError("an output has other keys than path, size, sha256")
+            raise ValueError("the keys of an output are not path, size, sha256")
         if type(item["size"]) is not int or item["size"] < 0:
             raise ValueError(f"output {item['path']!r} has no size")
         if not isinstance(item["sha256"], str) or not re.fullmatch(_SHA, item["sha256"]):
@@ -184,7 +184,7 @@ def _parse_manifest(value: Any) -> Manifest:
 
 
 def check_output_path(path: Any) -> str:
-    """``path`` if it stays inside an artefact and names none of its own two files.
+    """``path``, if it stays inside an artefact and is not its manifest or provenance.
 
     Raises:
         ValueError: empty, absolute, too long, with ``..``, a backslash or unprintable
@@ -193,7 +193,9 @@ def check_output_path(path: Any) -> str:
     if not isinstance(path, str) or not path or "\\" in path or "\0" in path:
         raise ValueError(f"output path {path!r} is not allowed")
     if len(path.encode("utf-8", "replace")) > _MAX_PATH_BYTES or not path.isprintable():
-        raise ValueError(f"output path {path[:40]!r} is too long or holds unprintable characters")
+        raise ValueError(
+            f"output path {path[:40]!r} is too long or contains unprintable characters"
+        )
     parts = PurePosixPath(path).parts
     if path.startswith("/") or ".." in parts or "/".join(parts) != path:
         raise ValueError(f"output path {path!r} is not allowed")
@@ -203,7 +205,7 @@ def check_output_path(path: Any) -> str:
 
 
 def encode_provenance(artefact_id: str, record: dict[str, Any]) -> bytes:
-    """The bytes of ``provenance.json``: the record, its artefact's id and a checksum of both."""
+    """The bytes of ``provenance.json``: a record, the artefact's id, and a checksum of both."""
     body = {"schema": SCHEMA, "artefact": artefact_id, "record": record}
     value = {**body, "sha256": digest(body)}
     return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode() + b"\n"

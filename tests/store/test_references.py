@@ -233,7 +233,7 @@ def test_naming_rewrites_only_what_changes(empty_store, artefact, publish):
 def test_a_name_of_something_that_is_gone(empty_store, artefact):
     empty_store.set_name("best", artefact)
     artefact.directory.rename(empty_store.root / ".quarantine" / "gone")
-    with pytest.raises(NotFound, match=f"'best' points to {artefact.id}, which is gone"):
+    with pytest.raises(NotFound, match=f"'best' points to {artefact.id}, which is missing"):
         empty_store.resolve("best")
 
 

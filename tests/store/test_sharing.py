@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from irlcli.errors import Busy, IntegrityError, NotFound
-from irlcli.store import KeyRecord, Store
-from irlcli.store import store as store_module
+from irlcli.store import KeyRecord, Store, collect, integrity
+from irlcli.store import artefact as artefact_module
+from irlcli.store import publish as publishing
 
 DAY = 86400.0
 
@@ -82,7 +83,7 @@ def test_verify_says_in_json_what_is_damaged(irl, empty_store, publish):
     assert (said["kind"], said["exit_code"], said["checked"]) == ("error", 4, 2)
     assert list(said["damaged"]) == [artefact.id] and sound.id not in result.out
     damage = said["damaged"][artefact.id]
-    assert "reward.pt" in damage["problems"][0] and "other bytes" in damage["problems"][0]
+    assert "reward.pt" in damage["problems"][0] and "differs" in damage["problems"][0]
     assert damage["command"] == "irl train-airl"
     assert Path(damage["quarantine"], "reward.pt").exists()
 
@@ -111,7 +112,7 @@ def test_verify_says_what_is_missing(irl, empty_store, publish):
     said = json.loads(result.out)
     assert (result.code, said["exit_code"], said["checked"]) == (4, 4, 3)
     assert said["missing"] == {demos.id: {"names": ["demos"], "made": [reward.id], "command": None}}
-    line = f"{demos.id} is gone: the name 'demos' points to it; {reward.id} came from it"
+    line = f"{demos.id} is missing: the name 'demos' points to it; {reward.id} was made from it"
     result = irl("verify", "--store", empty_store.root)
     assert result.err.splitlines()[0] == line
     assert "error: 1 of 3 names point to nothing: demos" in result.err
@@ -125,7 +126,7 @@ def test_verify_says_what_is_missing(irl, empty_store, publish):
     assert result.code == 0
     lost = {"names": [], "made": [reward.id], "command": None}
     assert json.loads(result.out)["missing"] == {demos.id: lost}
-    assert f"warning: {demos.id} is gone: {reward.id} came from it" in result.err
+    assert f"warning: {demos.id} is missing: {reward.id} was made from it" in result.err
     # What no name needs may go.
     (empty_store.root / ".names" / "kept").unlink()
     result = irl("verify", "--json", "--store", empty_store.root)
@@ -150,7 +151,7 @@ def test_what_was_quarantined_is_missing_with_the_command_that_makes_it(irl, emp
 def test_odd_provenance_leads_to_nothing_missing(irl, empty_store, monkeypatch, publish, inputs):
     made = publish(empty_store, inputs={"input": "0" * 64}).artefact
     empty_store.set_name("odd", made)
-    monkeypatch.setattr(store_module.Artefact, "provenance", lambda _: {"inputs": inputs})
+    monkeypatch.setattr(artefact_module.Artefact, "provenance", lambda _: {"inputs": inputs})
     for command in ("verify", "gc"):
         assert irl(command, "--store", empty_store.root).code == 0
 
@@ -181,13 +182,13 @@ def test_an_input_of_a_newer_schema_is_not_missing(irl, empty_store, publish, mi
 
 def manifests_read(monkeypatch) -> list[str]:
     read = []
-    original = store_module.read_manifest
+    original = artefact_module.read_manifest
 
     def counting(directory):
         read.append(directory.name)
         return original(directory)
 
-    monkeypatch.setattr(store_module, "read_manifest", counting)
+    monkeypatch.setattr(artefact_module, "read_manifest", counting)
     return read
 
 
@@ -224,6 +225,23 @@ def test_lineage_ends_where_content_leads_back(irl, empty_store, publish, seed):
 
 # Claims
 
+
+def before_the_next_repair(monkeypatch, act) -> None:
+    """Call ``act`` once, just before a process takes the lock under which it repairs."""
+    original = integrity.repairing
+
+    def put(function) -> None:
+        for module in (integrity, publishing):
+            monkeypatch.setattr(module, "repairing", function)
+
+    def interrupted(layout):
+        put(original)
+        act()
+        return original(layout)
+
+    put(interrupted)
+
+
 RECORD = KeyRecord("train-airl", 1, {"seed": 0}, {})
 
 
@@ -241,15 +259,12 @@ def test_a_claim_that_leads_nowhere_is_replaced_and_a_valid_one_never(empty_stor
     pointer.write_text("0" * 16)
     output = staged(store, "slow", b"slow")
     rival = None
-    original = Store._repairing
 
-    def interrupted(self):
+    def make_a_valid_claim() -> None:
         nonlocal rival
-        monkeypatch.setattr(Store, "_repairing", original)
         rival = Store(store.root).publish(RECORD, staged(store, "fast", b"fast"), {})
-        return original(self)
 
-    monkeypatch.setattr(Store, "_repairing", interrupted)
+    before_the_next_repair(monkeypatch, make_a_valid_claim)
     slow = store.publish(RECORD, output, {})
     assert rival is not None and rival.diverged is None
     assert slow.diverged == rival.artefact
@@ -275,15 +290,12 @@ def test_what_was_repaired_meanwhile_is_not_set_aside(empty_store, publish, monk
     path = artefact.directory / "reward.pt"
     path.chmod(0o644)
     path.write_bytes(b"x" * path.stat().st_size)
-    original = Store._repairing
 
-    def interrupted(self):
-        monkeypatch.setattr(Store, "_repairing", original)
+    def repair() -> None:
         Store(store.root).verify([artefact.id])
         publish(Store(store.root))
-        return original(self)
 
-    monkeypatch.setattr(Store, "_repairing", interrupted)
+    before_the_next_repair(monkeypatch, repair)
     with pytest.raises(Busy, match="repaired"):
         store.open(artefact, "reward.pt")
     assert store.ids() == [artefact.id] and store.verify([artefact.id]) == {}
@@ -293,9 +305,9 @@ def test_what_is_gone_is_not_called_damaged(empty_store, publish):
     artefact = publish(empty_store).artefact
     while empty_store.ids():
         empty_store.collect(0.0)
-    with pytest.raises(NotFound, match="gone"):
+    with pytest.raises(NotFound, match="missing"):
         empty_store.open(artefact, "reward.pt")
-    with pytest.raises(NotFound, match="gone"):
+    with pytest.raises(NotFound, match="missing"):
         empty_store.get(artefact.id)
     assert empty_store.find(artefact.manifest.record.key) is None
 
@@ -307,7 +319,7 @@ def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monk
     artefact = publish(empty_store).artefact
     with empty_store.working_on("0" * 64, wait=False) as scratch:
         scratch.save(b"state")
-    original = store_module._older
+    original = collect._older
 
     def vanishing(path, limit):
         if path.name == artefact.id:
@@ -317,7 +329,7 @@ def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monk
             scratch.clear()
         return original(path, limit)
 
-    monkeypatch.setattr(store_module, "_older", vanishing)
+    monkeypatch.setattr(collect, "_older", vanishing)
     assert empty_store.garbage(-1.0) == []
     assert empty_store.stale_work(-1.0) == []
 
@@ -385,7 +397,7 @@ def test_what_killed_processes_left_is_cleared_away(empty_store, publish):
     key = "0" * 64
     pid = os.fork()
     if pid == 0:
-        from irlcli.store import scratch
+        from irlcli.store import durable
 
         def killed(*_):
             os.kill(os.getpid(), signal.SIGKILL)
@@ -394,7 +406,7 @@ def test_what_killed_processes_left_is_cleared_away(empty_store, publish):
         with empty_store.working_on(key, wait=False) as place:
             place.save(b"first")
             place.new_output()
-            scratch.os.replace = killed
+            durable.os.replace = killed
             place.save(b"second")
         empty_store.set_name("best", artefact)
     assert os.WTERMSIG(os.waitpid(pid, 0)[1]) == signal.SIGKILL
@@ -419,11 +431,21 @@ def test_integrity_errors_of_a_store_without_its_empty_directories(empty_store, 
     assert len(list((empty_store.root / ".quarantine").iterdir())) == 1
 
 
-@pytest.mark.parametrize("call", ["file_digest", "read_provenance", "_entries"])
-def test_verify_survives_what_disappears_while_it_is_read(empty_store, publish, monkeypatch, call):
+@pytest.mark.parametrize(
+    "module, call",
+    [
+        (artefact_module, "file_digest"),
+        (integrity, "read_provenance"),
+        (integrity, "entries"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_verify_survives_what_disappears_while_it_is_read(
+    empty_store, publish, monkeypatch, module, call
+):
     """Another process collects the artefact between two looks at it: gone is not damaged."""
     artefact = publish(empty_store).artefact
-    original = getattr(store_module, call)
+    original = getattr(module, call)
 
     def vanishing(*arguments):
         if artefact.directory.exists():
@@ -431,6 +453,6 @@ def test_verify_survives_what_disappears_while_it_is_read(empty_store, publish, 
             artefact.directory.rename(empty_store.root / ".work" / "x")
         return original(*arguments)
 
-    monkeypatch.setattr(store_module, call, vanishing)
+    monkeypatch.setattr(module, call, vanishing)
     assert empty_store.verify([artefact.id]) == {}
     assert list((empty_store.root / ".quarantine").iterdir()) == []

@@ -1,0 +1,103 @@
+"""A published artefact: its directory, its manifest, and checks that change nothing."""
+
+import stat
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from irlcli.errors import IntegrityError, NotFound, suggest
+from irlcli.store.digest import file_digest
+from irlcli.store.layout import ID_DIGITS
+from irlcli.store.manifest import (
+    MANIFEST,
+    PROVENANCE,
+    Manifest,
+    Output,
+    read_json,
+    read_manifest,
+    read_provenance,
+)
+
+
+class Artefact(NamedTuple):
+    """A published artefact: its directory and its manifest."""
+
+    directory: Path
+    manifest: Manifest
+
+    @property
+    def id(self) -> str:
+        """The first 16 hexadecimal digits of the id, which name the directory."""
+        return self.directory.name
+
+    def output(self, path: str) -> Output:
+        """The output at ``path``.
+
+        Raises:
+            NotFound: the artefact has no such output.
+        """
+        for output in self.manifest.outputs:
+            if output.path == path:
+                return output
+        names = [o.path for o in self.manifest.outputs]
+        raise NotFound(f"artefact {self.id} has no output {path!r}", suggest(path, names))
+
+    def provenance(self) -> dict[str, Any]:
+        """How it was made: command line, versions, timings.
+
+        Raises:
+            IntegrityError: altered or unreadable.
+        """
+        return read_provenance(self.directory, self.manifest.id)
+
+
+class Published(NamedTuple):
+    """A published artefact; ``diverged`` is the different one that holds its key, if any."""
+
+    artefact: Artefact
+    diverged: Artefact | None = None
+
+
+def read_artefact(directory: Path) -> Artefact:
+    """The artefact in ``directory``, its manifest checked against the directory's name.
+
+    Raises:
+        IntegrityError: the manifest is missing or damaged, or belongs to another artefact.
+        NewerFormat: the manifest has a newer schema.
+    """
+    manifest = read_manifest(directory)
+    if manifest.id[:ID_DIGITS] != directory.name:
+        raise IntegrityError(f"{directory / MANIFEST} does not match its directory's name")
+    return Artefact(directory, manifest)
+
+
+def output_problem(directory: Path, output: Output, quick: bool = False) -> str | None:
+    """Why a file is not the published output; None if it is. ``quick`` compares sizes only."""
+    path = directory / output.path
+    try:
+        information = path.lstat()
+        if not stat.S_ISREG(information.st_mode):
+            return f"{path} is not a plain file"
+        if any((directory / part).is_symlink() for part in Path(output.path).parents):
+            return f"{path} is reached through a symbolic link"
+        if information.st_size != output.size:
+            return f"{path} has {information.st_size} bytes instead of {output.size}"
+        if not quick and file_digest(path) != output.sha256:
+            return f"{path} differs from the published bytes"
+    except OSError as error:
+        return f"{path} cannot be read ({error.strerror})"
+    return None
+
+
+def entries(directory: Path) -> list[Path]:
+    """All paths below ``directory`` except plain directories."""
+    return [p for p in directory.rglob("*") if p.is_symlink() or not p.is_dir()]
+
+
+def recorded_command(directory: Path) -> str:
+    """The command line in a provenance that may be damaged; empty if it cannot be read."""
+    import shlex
+
+    try:
+        return shlex.join(read_json(directory / PROVENANCE)["record"]["command"])
+    except (IntegrityError, KeyError, TypeError):
+        return ""

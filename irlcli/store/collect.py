@@ -1,0 +1,149 @@
+"""Garbage collection: names and their ancestors are kept, and whatever is young."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from irlcli.errors import IntegrityError
+from irlcli.store.artefact import Artefact, recorded_command
+from irlcli.store.durable import remove, remove_leftovers
+from irlcli.store.index import Index
+from irlcli.store.integrity import quarantined
+from irlcli.store.layout import Layout, claims, is_id, make_directories
+from irlcli.store.lock import is_locked, locked
+from irlcli.store.read import index as read_index
+from irlcli.store.references import names
+
+
+class Missing(NamedTuple):
+    """A missing artefact and what refers to it.
+
+    ``names`` point to it, and the artefacts ``made`` were made from it. ``place`` is its path in
+    quarantine and ``command`` made it; None and empty if it is not there.
+    """
+
+    names: list[str]
+    made: list[str]
+    place: Path | None
+    command: str
+
+    def text(self, id16: str) -> str:
+        """One line about the artefact ``id16``."""
+        reasons = [f"the name {name!r} points to it" for name in self.names]
+        reasons += [f"{', '.join(self.made)} was made from it"] if self.made else []
+        where = f" (damaged, now in {self.place})" if self.place is not None else ""
+        return f"{id16} is missing{where}: {'; '.join(reasons)}"
+
+
+def garbage(layout: Layout, grace_seconds: float, warn: Callable[[str], None]) -> list[Artefact]:
+    """Artefacts that no name needs and that are older than the grace period [s].
+
+    Artefacts of a newer schema, and whatever their manifests mention, are never garbage.
+    """
+    index = read_index(layout, warn)
+    for id16, lost in missing(layout, index).items():
+        warn(f"{lost.text(id16)}; gc cannot protect the inputs of {id16}")
+    kept = index.reached_from(names(layout).values())
+    limit = time.time() - grace_seconds
+    return [
+        artefact
+        for id16, artefact in index.artefacts.items()
+        if id16 not in kept and _older(artefact.directory, limit)
+    ]
+
+
+def missing(layout: Layout, index: Index) -> dict[str, Missing]:
+    """Artefacts that names or ancestors of named artefacts refer to but that do not exist, by id.
+
+    Files from outside the store, and inputs whose provenance cannot be read, are not reported.
+    ``index`` may be older than the store: artefacts published since are not missing.
+    """
+    pointers = names(layout)
+    present = index.artefacts.keys() | index.newer.keys()
+    found: dict[str, Missing] = {}
+
+    def lost(id16: str) -> Missing:
+        place = quarantined(layout, id16)
+        command = "" if place is None else recorded_command(place)
+        return found.setdefault(id16, Missing([], [], place, command))
+
+    for name, id16 in pointers.items():
+        if id16 not in present and not (layout.root / id16).is_dir():
+            lost(id16).names.append(name)
+    for id16 in sorted(index.reached_from(pointers.values())):
+        artefact = index.artefacts[id16]
+        roles = [role for role, holders in index.parents(artefact).items() if not holders]
+        for source in _stored_inputs(artefact, roles):
+            if source not in present:
+                lost(source).made.append(id16)
+    return found
+
+
+def stale_work(layout: Layout, grace_seconds: float) -> list[Path]:
+    """Working directories that no process holds and that are older than the grace period [s]."""
+    limit = time.time() - grace_seconds
+    try:
+        entries = sorted(layout.work.iterdir())
+    except FileNotFoundError:
+        return []
+    return [
+        path for path in entries if _older(path, limit) and not is_locked(layout.locks / path.name)
+    ]
+
+
+def collect(
+    layout: Layout, grace_seconds: float, warn: Callable[[str], None]
+) -> tuple[list[Artefact], list[Path]]:
+    """Remove :func:`garbage` and :func:`stale_work`; returns what was removed.
+
+    Temporary files of dead processes are removed too, whatever their age.
+
+    Raises:
+        Busy: the store is in use.
+    """
+    if not layout.marker.exists():
+        return [], []
+    make_directories(layout)
+    with locked(layout.gc_lock, what=f"the store {layout.root}"):
+        artefacts, work = garbage(layout, grace_seconds, warn), stale_work(layout, grace_seconds)
+        pointers: dict[str, list[Path]] = {}
+        for pointer, id16 in claims(layout):
+            pointers.setdefault(id16, []).append(pointer)
+        for artefact in artefacts:
+            for pointer in pointers.get(artefact.id, []):
+                pointer.unlink(missing_ok=True)
+                (layout.locks / pointer.name).unlink(missing_ok=True)
+            # A unique name: an interrupted gc may have left an earlier, half-removed copy.
+            grave = layout.work / f"removed-{artefact.id}-{os.urandom(4).hex()}"
+            artefact.directory.chmod(0o755)
+            artefact.directory.rename(grave)
+            shutil.rmtree(grave)
+        for path in work:
+            remove(path)
+            (layout.locks / path.name).unlink(missing_ok=True)
+        for directory in (layout.root, layout.keys, layout.names, layout.work):
+            remove_leftovers(directory)
+        return artefacts, work
+
+
+def _stored_inputs(artefact: Artefact, roles: Iterable[str]) -> list[str]:
+    """The ids that the inputs ``roles`` were read from; files outside the store are left out."""
+    try:
+        places = artefact.provenance().get("inputs") if roles else None
+    except IntegrityError:
+        return []
+    if not isinstance(places, dict):
+        return []
+    texts = [str(places.get(role, "")).partition("/") for role in roles]
+    return [id16 for id16, slash, _ in texts if slash and is_id(id16)]
+
+
+def _older(path: Path, limit: float) -> bool:
+    """Whether ``path`` exists and was last changed before ``limit`` [s since 1970]."""
+    try:
+        return path.stat().st_mtime < limit
+    except FileNotFoundError:
+        return False

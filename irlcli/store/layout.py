@@ -1,0 +1,170 @@
+"""Where a store keeps its files, and how they are named.
+
+::
+
+    runs/STORE                     format version
+    runs/<id16>/                   manifest.json provenance.json reward.pt ...
+    runs/.keys/<key>               id16 of the artefact that holds the key
+    runs/.names/<name>             id16 of the artefact that has the name
+    runs/.work/<key>/              checkpoint and unfinished outputs of a running stage
+    runs/.locks/  .quarantine/
+"""
+
+import re
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from irlcli.errors import IntegrityError, UsageError
+from irlcli.store.durable import write_durably
+from irlcli.store.manifest import read_json
+
+FORMAT = 1
+DEFAULT_ROOT = "runs"
+ID_DIGITS = 16
+_ID = rf"[0-9a-f]{{{ID_DIGITS}}}"
+_KEY = r"[0-9a-f]{64}"
+_PREFIX = r"[0-9a-f]{3,64}"
+_NAME = r"[A-Za-z][A-Za-z0-9._-]{0,99}"
+_OWN = (".keys", ".names", ".work", ".locks", ".quarantine")
+
+
+class Layout(NamedTuple):
+    """The paths of the store in the directory ``root``.
+
+    A ``read_only`` store is never changed: nothing is created, moved or locked in it.
+    """
+
+    root: Path
+    read_only: bool = False
+
+    @property
+    def marker(self) -> Path:
+        return self.root / "STORE"
+
+    @property
+    def keys(self) -> Path:
+        return self.root / ".keys"
+
+    @property
+    def names(self) -> Path:
+        return self.root / ".names"
+
+    @property
+    def work(self) -> Path:
+        return self.root / ".work"
+
+    @property
+    def locks(self) -> Path:
+        return self.root / ".locks"
+
+    @property
+    def quarantine(self) -> Path:
+        return self.root / ".quarantine"
+
+    @property
+    def gc_lock(self) -> Path:
+        return self.locks / "gc"
+
+
+def check(layout: Layout) -> None:
+    """Check that the root is a store of a known format, an empty directory, or absent.
+
+    Raises:
+        IntegrityError: the root holds other files, a newer store, or links in place of directories.
+        UsageError: the root is not a directory.
+    """
+    root, marker = layout.root, layout.marker
+    hint = "name a directory with --store"
+    try:
+        if not stat.S_ISDIR(root.stat().st_mode):
+            raise UsageError(f"{root} is not a directory", hint)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise UsageError(f"{root} cannot be a store ({error.strerror})", hint) from None
+    if marker.exists():
+        value = read_json(marker)
+        version = value.get("format") if isinstance(value, dict) else None
+        if type(version) is not int or version < 1:
+            raise IntegrityError(
+                f"{marker} does not contain a format version", "check that this is an irlcli store"
+            )
+        if version > FORMAT:
+            raise IntegrityError(
+                f"{root} is a store of format {version}, newer than the supported {FORMAT}",
+                "a newer irlcli wrote it: upgrade irlcli, or name another --store",
+            )
+    elif root.exists() and any(
+        # An interrupted create() leaves these behind.
+        path.name not in _OWN and not path.name.startswith(".STORE.")
+        for path in root.iterdir()
+    ):
+        raise IntegrityError(
+            f"{root} contains files but is not a store",
+            "name a store, or an empty or new directory, with --store",
+        )
+    for name in _OWN:
+        if (root / name).is_symlink():
+            # A link would let the store write, move and remove files elsewhere.
+            raise IntegrityError(
+                f"{root / name} is a symbolic link", "replace the link with a directory"
+            )
+
+
+def create(layout: Layout) -> None:
+    """Create the directories and the format marker if they are missing.
+
+    Raises:
+        OSError: the root is not writable.
+    """
+    if layout.marker.exists():
+        return
+    make_directories(layout)
+    # Created now: a user who may only read the store later cannot create it, but can lock it.
+    layout.gc_lock.touch()
+    write_durably(layout.marker, b'{"format": %d}\n' % FORMAT)
+
+
+def make_directories(layout: Layout) -> None:
+    """Create the store's own directories; git, for one, does not keep empty ones."""
+    for name in _OWN:
+        (layout.root / name).mkdir(parents=True, exist_ok=True)
+
+
+def is_id(text: str) -> bool:
+    """Whether ``text`` is the name of an artefact's directory."""
+    return re.fullmatch(_ID, text) is not None
+
+
+def is_prefix(text: str) -> bool:
+    """Whether ``text`` can be the beginning of an id: 3 to 64 hexadecimal digits."""
+    return re.fullmatch(_PREFIX, text) is not None
+
+
+def is_name(text: str) -> bool:
+    """Whether ``text`` has the form of a name."""
+    return re.fullmatch(_NAME, text) is not None
+
+
+def claims(layout: Layout) -> Iterator[tuple[Path, str]]:
+    """Each key's file and the id it points to. Reads no manifest."""
+    if not layout.keys.is_dir():
+        return
+    for path in layout.keys.iterdir():
+        id16 = pointed_to(path)
+        if re.fullmatch(_KEY, path.name) and id16 is not None:
+            yield path, id16
+
+
+def pointed_to(path: Path) -> str | None:
+    """The id that the file of a name or key contains; None if absent or malformed."""
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return None
+        with open(path, "rb") as file:
+            text = file.read(2 * ID_DIGITS).decode("ascii").strip()
+    except (FileNotFoundError, UnicodeDecodeError):
+        return None
+    return text if is_id(text) else None

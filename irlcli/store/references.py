@@ -1,0 +1,168 @@
+"""What a user may write to refer to an artefact: a path, a name, or an id prefix."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from irlcli.errors import NotFound, UsageError, closest
+from irlcli.store.artefact import Artefact, recorded_command
+from irlcli.store.durable import write_durably
+from irlcli.store.layout import (
+    DEFAULT_ROOT,
+    ID_DIGITS,
+    Layout,
+    is_name,
+    is_prefix,
+    pointed_to,
+)
+from irlcli.store.read import get, ids
+
+
+class Resolved(NamedTuple):
+    """What a reference names: an artefact or one of its outputs, or a path outside the store."""
+
+    artefact: Artefact | None
+    path: Path
+
+    @property
+    def output(self) -> str | None:
+        """The output's path inside the artefact; None if the reference names all of it."""
+        if self.artefact is None or self.path == self.artefact.directory:
+            return None
+        return self.path.relative_to(self.artefact.directory).as_posix()
+
+
+def resolve(layout: Layout, ref: str) -> Resolved:
+    """What ``ref`` names.
+
+    Either a name or a unique id prefix (at least 3 digits), alone, before ``/OUTPUT``, or in a
+    path below the store's directory or below ``runs/``, which stands for any store; or an
+    existing file or directory outside the store.
+
+    Raises:
+        NotFound: nothing matches, or more than one artefact.
+        IntegrityError: the artefact is damaged.
+    """
+    root, absolute = os.path.abspath(layout.root), os.path.abspath(ref)
+    inside = absolute.startswith(root + os.sep)
+    text = os.path.relpath(absolute, root) if inside else ref.rstrip("/")
+    found = _inside(layout, text)
+    if found is None and not inside:
+        if os.path.exists(ref):
+            return Resolved(None, Path(ref))
+        # A path printed by a run with the default store, used with a store elsewhere.
+        default, _, below = os.path.normpath(text).partition("/")
+        if default == DEFAULT_ROOT and below:
+            text = below
+            found = _inside(layout, text)
+    if found is None:
+        close = closest(text.partition("/")[0], names(layout))
+        suggestion = f"did you mean {close!r}? " if close is not None else ""
+        raise NotFound(
+            f"{ref!r} names no artefact and no file",
+            f"{suggestion}`irl ls` lists the artefacts",
+        )
+    return found
+
+
+def _inside(layout: Layout, text: str) -> Resolved | None:
+    """An artefact, or ``artefact/output``, for a path relative to the store."""
+    head, _, rest = text.partition("/")
+    if os.path.isabs(text) or head in ("", ".", ".."):
+        return None
+    artefact = _by_name(layout, head) or _by_prefix(layout, head)
+    if artefact is None:
+        return None
+    if not rest:
+        return Resolved(artefact, artefact.directory)
+    # Only what the manifest lists is an output, so no path leads out of the artefact.
+    artefact.output(rest)
+    return Resolved(artefact, artefact.directory / rest)
+
+
+def _by_name(layout: Layout, name: str) -> Artefact | None:
+    id16 = named(layout, name)
+    if id16 is None:
+        return None
+    if not (layout.root / id16).is_dir():
+        raise _missing(layout, name, id16)
+    return get(layout, id16)
+
+
+def _missing(layout: Layout, name: str, id16: str) -> NotFound:
+    from irlcli.store.integrity import quarantined
+
+    place = quarantined(layout, id16)
+    if place is None:
+        return NotFound(
+            f"the name {name!r} points to {id16}, which is missing",
+            "name another artefact with `irl name`",
+        )
+    command = recorded_command(place)
+    return NotFound(
+        f"the name {name!r} points to {id16}, which was damaged and is now in {place}",
+        f"compute it again: {command}" if command else "compute it again",
+    )
+
+
+def _by_prefix(layout: Layout, prefix: str) -> Artefact | None:
+    if not is_prefix(prefix):
+        return None
+    short = prefix[:ID_DIGITS]
+    if len(short) == ID_DIGITS:
+        # A whole id is looked up directly, without listing the store.
+        matches = [short] if os.path.lexists(layout.root / short) else []
+    else:
+        matches = [name for name in ids(layout) if name.startswith(short)]
+    if len(matches) > 1:
+        shown = ", ".join(matches[:5]) + (", ..." if len(matches) > 5 else "")
+        raise NotFound(f"{prefix!r} is ambiguous: {shown}", "write more digits of the id")
+    if not matches:
+        return None
+    artefact = get(layout, matches[0])
+    return artefact if artefact.manifest.id.startswith(prefix) else None
+
+
+def names(layout: Layout) -> dict[str, str]:
+    """Name to id, sorted by name."""
+    try:
+        entries = sorted(path.name for path in layout.names.iterdir())
+    except FileNotFoundError:
+        return {}
+    found = {name: named(layout, name) for name in entries}
+    return {name: id16 for name, id16 in found.items() if id16 is not None}
+
+
+def named(layout: Layout, name: str) -> str | None:
+    """The id that ``name`` points to. Reads one file, however many names exist."""
+    return pointed_to(layout.names / name) if is_name(name) else None
+
+
+def check_name(name: str) -> None:
+    """Refuse an invalid name.
+
+    Raises:
+        UsageError: the name has other characters than letters, digits and ``._-``, does not
+            begin with a letter, or reads as an id prefix.
+    """
+    if not is_name(name) or is_prefix(name):
+        raise UsageError(
+            f"{name!r} cannot be a name",
+            "use a letter, then letters, digits, '.', '_' or '-'; hexadecimal digits alone would "
+            "read as an id",
+        )
+
+
+def set_name(layout: Layout, name: str, artefact: Artefact) -> str | None:
+    """Point ``name`` to ``artefact``; returns the id of another artefact it pointed to.
+
+    Raises:
+        UsageError: as :func:`check_name`.
+    """
+    check_name(name)
+    before = named(layout, name)
+    if before == artefact.id:
+        return None
+    layout.names.mkdir(exist_ok=True)
+    write_durably(layout.names / name, artefact.id.encode() + b"\n")
+    return before
