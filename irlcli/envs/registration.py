@@ -29,6 +29,8 @@ def make(env: str, setting: Setting, render_mode: str | None = None) -> gymnasiu
     Raises:
         UsageError: unknown environment, or an intervention it does not have.
     """
+    # Environments that were added since this module was imported.
+    register()
     return gymnasium.make(
         environment(env).gym_id, render_mode=render_mode, **env_kwargs(env, setting)
     ).unwrapped

@@ -1,27 +1,26 @@
-"""What a learned reward pays, against the same network written out in numpy."""
+"""Learned returns, against the same network written out in numpy."""
 
 import json
 import math
 import re
 
-import gymnasium
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from msgspec.structs import asdict
 
 from irlcli.configs import AIRLConfig
 from irlcli.data import descriptions
 from irlcli.data import tensors as checkpoints
-from irlcli.data.tensors import load_policy_file
+from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
 from irlcli.learners.reward_model import RewardModel
-from irlcli.rl import ppo as rl
-from irlcli.trajectories import Trajectory
+from irlcli.rl.rollout import roll_out
+from irlcli.trajectories import ActionSpace, Trajectory
 
 
 def by_hand(path, about):
@@ -45,7 +44,7 @@ def by_hand(path, about):
 
 
 @pytest.mark.parametrize("agent", ["policy", "idle"])
-def test_evaluate_says_what_the_reward_pays(irl, store_copy, agent):
+def test_the_learned_return_is_the_sum_of_the_networks_outputs(irl, store_copy, agent):
     whom = ["--idle"] if agent == "idle" else ["--policy", "moved"]
     common = ["--ood", "1.5x", "--episodes", "3", "--store", store_copy.path, "--profile", "smoke"]
     done = irl("evaluate", *whom, "--reward", "airl", *common)
@@ -64,7 +63,7 @@ def test_evaluate_says_what_the_reward_pays(irl, store_copy, agent):
     setting = parse_setting("lunar-lander", "engine-power=1.5x")
     made_with = json.loads((made / "manifest.json").read_text())["parameters"]
     modal = made_with["evaluation"]["deterministic"]
-    trajectories = rl.roll_out("lunar-lander", setting, policy, 3, 0, "evaluate", modal)
+    trajectories = roll_out("lunar-lander", setting, policy, 3, 0, "evaluate", modal)
     horizon = environment("lunar-lander").max_episode_steps
     expected = []
     for t in trajectories:
@@ -155,7 +154,7 @@ def continuous(path, actions, numbers=None):
         activation="tanh",
         gamma=0.9,
     )
-    settings = AIRLConfig(method="erm", actions=actions, fixed_horizon=False)
+    settings = AIRLConfig(actions=actions, fixed_horizon=False)
     about = descriptions.Reward(
         env="ant",
         settings=("mass=2x",),
@@ -165,18 +164,25 @@ def continuous(path, actions, numbers=None):
         network=network,
         scale=2.0,
     )
-    model = RewardModel(**msgspec.to_builtins(network))
+    model = RewardModel(**asdict(network))
     state = {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
     state["normaliser.variance"] += 1.0
     state["g.0.weight"] = torch.tensor(numbers or [[2.0, 3.0]])
     checkpoints.save(path, "reward", about, state)
 
 
+BOX = ActionSpace(False, 1, np.array([-1.0], np.float32), np.array([1.0], np.float32))
+
+
+def frozen(path, observation_size, actions):
+    model, origin = load_reward_file(path)
+    return FrozenReward(model, origin, 1000, 0.9, "x", observation_size, actions)
+
+
 @pytest.mark.parametrize(("actions", "second"), [("executed", 1.0), ("sampled", 5.0)])
 def test_actions_are_clipped_where_the_reward_saw_them_so(tmp_path, actions, second):
     continuous(tmp_path / "reward.pt", actions)
-    box = gymnasium.spaces.Box(-1, 1, (1,))
-    reward = FrozenReward(tmp_path / "reward.pt", "ant", "ant", box, box)
+    reward = frozen(tmp_path / "reward.pt", 1, BOX)
     episode = Trajectory(
         observations=np.array([[1.0], [2.0], [50.0]], np.float32),
         actions=np.array([[-1.0], [5.0]], np.float32),
@@ -192,14 +198,14 @@ def test_actions_are_clipped_where_the_reward_saw_them_so(tmp_path, actions, sec
 
 def test_what_the_reward_cannot_measure_is_refused(tmp_path, smoke_store):
     path = smoke_store.path / smoke_store.airl / "reward.pt"
-    box, four = gymnasium.spaces.Box(-1, 1, (8,)), gymnasium.spaces.Discrete(4)
-    for observations, actions, message in (
-        (gymnasium.spaces.Box(-1, 1, (9,)), four, "size 8, those of x have size 9"),
-        (box, gymnasium.spaces.Discrete(2), "takes 4 discrete actions, those of x are 2 discrete"),
-        (box, box, "takes 4 discrete actions, those of x are actions of size 8"),
+    four = ActionSpace(True, 4, np.empty(0), np.empty(0))
+    for size, actions, message in (
+        (9, four, "of size 8, but x has size 9"),
+        (8, four._replace(size=2), "takes 4 discrete actions, but x has 2 discrete"),
+        (8, BOX, "takes 4 discrete actions, but x has actions of size 1"),
     ):
         with pytest.raises(UsageError, match=message):
-            FrozenReward(path, "lunar-lander", "x", observations, actions)
+            frozen(path, size, actions)
     continuous(tmp_path / "reward.pt", "executed", [[2.0, math.nan]])
     with pytest.raises(IntegrityError, match="not finite"):
-        FrozenReward(tmp_path / "reward.pt", "ant", "x", box, box)
+        frozen(tmp_path / "reward.pt", 1, BOX)
