@@ -44,7 +44,7 @@ class Variant(msgspec.Struct, frozen=True, kw_only=True):
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the sweep depends on, besides its datasets (``seeds``, in the order of the inputs).
 
-    The fields of a :class:`Variant` have their defaults in ``maxent``.
+    ``shared`` are the hyperparameters of all variants; what the variants replace is at its default.
     """
 
     environment: EnvironmentKey
@@ -53,7 +53,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     variants: tuple[Variant, ...]
     gridworld: GridworldConfig
-    maxent: MaxEntConfig
+    shared: MaxEntConfig
 
 
 def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Variant, ...]:
@@ -96,8 +96,7 @@ def request(
     check_tabular(env, "sweep-maxent", wanted=True)
     texts = tuple(str(s) for s in settings_)
     requests = datasets(env, settings_, config)
-    # What the variants replace, and the defaults of what they leave unused.
-    unswept = replace(config.maxent, **asdict(Variant(grouping="pooled")))
+    shared = replace(config.maxent, **asdict(Variant(grouping="pooled")))
     parameters = Parameters(
         environment=environment_key(env),
         settings=texts,
@@ -105,7 +104,7 @@ def request(
         seeds=tuple(r.parameters.seed for r in requests),
         variants=variants(config.figure2.penalty_weights, config.figure2.l2s),
         gridworld=config.gridworld,
-        maxent=relevant_maxent(unswept),
+        shared=relevant_maxent(shared),
     )
     inputs = {f"demonstrations {r.parameters.seed}": From(r) for r in requests}
     label = f"sweep-maxent {env} {', '.join(texts)} {len(requests)} datasets"
@@ -151,7 +150,7 @@ def run(job: Job) -> None:
     for texts, seen in ((p.settings, True), (p.unseen, False)):
         if not texts:
             continue
-        measures = vars(judge(texts, p.gridworld, reward, p.maxent.held_out))
+        measures = vars(judge(texts, p.gridworld, reward, p.shared.held_out))
         rows += [
             {
                 "variant": str(v),
@@ -180,7 +179,7 @@ def _fit(job, settings, demos, runs, rewards, state):
     from irlcli.learners.maxent import MaxEnt, group_risks
 
     p: Parameters = job.parameters
-    m, horizon = p.maxent, p.gridworld.horizon
+    m, horizon = p.shared, p.gridworld.horizon
     with tasks.usable_input():
         learner = MaxEnt(
             settings,
