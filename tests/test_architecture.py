@@ -56,10 +56,14 @@ EXCEPTIONS = {
 
 
 def modules():
+    """Path by dotted name below irlcli."""
     return {
         path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", "."): path
         for path in sorted(PACKAGE.rglob("*.py"))
     }
+
+
+KNOWN = {name.removesuffix(".__init__") for name in modules()}
 
 
 def imported(path, top_level_only=False):
@@ -73,9 +77,11 @@ def imported(path, top_level_only=False):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            # An imported name may be a module itself.
-            names.add(node.module)
-            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+            for alias in node.names:
+                # The imported name may be a module itself.
+                inner = f"{node.module}.{alias.name}"
+                is_module = inner.removeprefix("irlcli.") in KNOWN
+                names.update([inner] if is_module else [node.module, inner])
         inside_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         if not (top_level_only and inside_function):
             for child in ast.iter_child_nodes(node):
