@@ -69,8 +69,9 @@ def test_a_penalty(irl, lab, store_copy, monkeypatch):
 def test_a_learner(irl, lab, store_copy, monkeypatch):
     lab("gail.py")
     monkeypatch.setitem(learners.LEARNERS, "gail", "lab.gail:GAIL")
-    gail = trained(irl, store_copy, "--set", "airl.learner=gail")
-    airl = trained(irl, store_copy)
+    variable = ["--set", "airl.fixed_horizon=false"]
+    gail = trained(irl, store_copy, "--set", "airl.learner=gail", *variable)
+    airl = trained(irl, store_copy, *variable)
     assert gail.manifest.record.parameters["airl"]["learner"] == "gail"
     policies = [(a.directory / "policy.pt").read_bytes() for a in (gail, airl)]
     assert policies[0] != policies[1]
