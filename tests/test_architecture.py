@@ -12,7 +12,10 @@ HEAVY = {
     *("torch", "stable_baselines3", "gymnasium", "pybullet", "pybullet_data", "pandas", "pyarrow"),
     *("Box2D", "scipy", "matplotlib", "PIL"),
 }
-FILES = {"irlcli.data.tensors", "irlcli.data.demonstrations", "irlcli.data.outputs", "pathlib"}
+FILES = {
+    *("irlcli.data.tensors", "irlcli.data.parquet", "irlcli.data.demonstrations"),
+    *("irlcli.data.outputs", "pathlib"),
+}
 
 # Layers, lowest first: a package imports only from its own layer's list or from below.
 LAYERS = [

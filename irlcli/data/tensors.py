@@ -32,7 +32,7 @@ from irlcli.rl.policy import Policy, load_policy
 SCHEMA = 1
 # The networks here have tens of thousands of parameters.
 _MAX_BYTES = 256 << 20
-_KINDS = {
+_KINDS: dict[str, Any] = {
     "reward": descriptions.Reward,
     "tabular-reward": descriptions.TabularReward,
     "policy": descriptions.Policy,
