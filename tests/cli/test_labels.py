@@ -1,0 +1,91 @@
+"""Labels of artefacts and plans, and flags of single commands."""
+
+import shutil
+
+import pytest
+
+from irlcli.cli import console
+from irlcli.errors import UsageError
+from irlcli.store import Store
+
+SMOKE = ["--profile", "smoke"]
+TRAIN = ["train-airl", "--demos", "demos", "--method", "irm", "--name", "airl"]
+TRANSFER = ["transfer", "--reward", "airl/reward.pt", "--ood", "1.5x", "--name", "moved"]
+
+
+def test_ls_shows_the_method_behind_transfers_and_evaluations(irl, store_copy):
+    """Method and lambda come from the reward: their own parameters have neither."""
+    listed = irl("ls", "--store", store_copy.path).out
+    (transfer,) = (row for row in listed.splitlines() if store_copy.transfer in row)
+    (score,) = (row for row in listed.splitlines() if store_copy.evaluation in row)
+    made = Store(store_copy.path).get(store_copy.airl).manifest.record.parameters["airl"]
+    learned = f"of train-airl irm lambda {made['penalty_weight']:g} seed 0"
+    assert learned in transfer
+    assert f"of transfer seed 0 {learned}" in score
+    shutil.rmtree(store_copy.path / store_copy.airl)
+    assert "lambda" not in irl("ls", "--store", store_copy.path).out  # No longer known.
+
+
+def test_the_label_of_a_transfer_names_the_method_of_its_reward(irl, store_copy, tmp_path):
+    """Otherwise transfers of two methods would share a label and a TensorBoard directory."""
+    plan = irl(*TRANSFER, *SMOKE, "--seed", "9", "--dry-run", "--store", store_copy.path).out
+    assert "seed 9" in plan and "irm lambda" in plan
+    shutil.copy(store_copy.path / store_copy.airl / "reward.pt", tmp_path)
+    line = ["transfer", "--reward", tmp_path / "reward.pt", "--ood", "1.5x", "--seed", "9"]
+    assert irl(*line, *SMOKE, "--dry-run", "--store", store_copy.path).out == plan
+
+
+def test_labels_of_evaluations_distinguish_policies(irl, store_copy, tmp_path):
+    place = ["--dry-run", "--store", store_copy.path]
+    line = ["evaluate", "--expert", "--trained-in", "engine-power=1x,1.25x"]
+    plan = irl(*line, "--env", "lunar-lander", "--ood", "engine-power=1.5x", *SMOKE, *place).out
+    for own in ("1x", "1.25x"):
+        assert f"evaluate expert of engine-power={own} in lunar-lander engine-power=1.5x" in plan
+    plan = irl("evaluate", "--policy", "airl", "--ood", "1.5x", *SMOKE, *place).out
+    assert "evaluate student irm of seed 0 in lunar-lander engine-power=1.5x seed 0" in plan
+    store = Store(store_copy.path)
+    makers = (a for a in store.artefacts() if a.manifest.record.stage == "train-expert")
+    for expert in makers:
+        own = expert.manifest.record.parameters["setting"]
+        plan = irl("evaluate", "--policy", expert.id, "--ood", "1.5x", *SMOKE, *place).out
+        assert f"evaluate expert of {own} in lunar-lander engine-power=1.5x seed 0" in plan
+
+
+def test_version(irl):
+    from importlib.metadata import version
+
+    assert irl("--version") == (0, f"irlcli {version('irlcli')}\n", "")
+
+
+def test_state_only_can_be_switched_off(irl, smoke_store, tmp_path):
+    (tmp_path / "on.toml").write_text("[airl]\nstate_only = true")
+    plans = [
+        irl(*TRAIN, *SMOKE, *flags, "--dry-run", "--store", smoke_store.path).out
+        for flags in (
+            [],
+            ["--settings", tmp_path / "on.toml", "--no-state-only"],
+            ["--settings", tmp_path / "on.toml"],
+            ["--state-only"],
+        )
+    ]
+    assert plans[0] == plans[1] and plans[0].startswith("HIT")
+    assert plans[2] == plans[3] and plans[2].startswith("RUN")
+
+
+def test_help_explains_the_default_seed_of_demonstrations(irl):
+    assert "always 0" in " ".join(irl("collect-experts", "--help").out.split())
+
+
+def test_a_missing_tensorboard_is_reported_before_training(monkeypatch, irl, store_copy, tmp_path):
+    import importlib.util
+
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "tensorboard" else found(name)
+    )
+    line = [*TRAIN, *SMOKE, "--seed", "8", "--tensorboard", tmp_path / "logs"]
+    done = irl(*line, "--store", store_copy.path)
+    assert (done.code, done.out) == (2, "")
+    assert "pip install tensorboard" in done.err and "RUN" not in done.err
+    with pytest.raises(UsageError):
+        console.TerminalConsole(tensorboard=tmp_path)

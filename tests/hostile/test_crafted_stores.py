@@ -1,0 +1,227 @@
+"""Stores that somebody else wrote: planted checkpoints, links that lead out, false summaries."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from chains import CHAIN, GRIDWORLD, SMOKE, assert_refused
+
+from irlcli.data.tensors import restore, to_bytes
+from irlcli.experiments import provenance
+from irlcli.stages import train_maxent, transfer
+from irlcli.stages.base import Stage
+from irlcli.store import Store
+
+
+def test_checkpoints_of_another_stage_are_not_used():
+    warnings = []
+    names = {"round", "rows"}
+    assert restore(to_bytes({"round": 1, "rows": "[]"}), names, warnings.append)["round"] == 1
+    assert restore(None, names, warnings.append) is None and not warnings
+    for value in ([], {}, {"round": 1}, {"round": 1, "rows": "", "more": 0}, "text", torch.ones(2)):
+        assert restore(to_bytes(value), names, warnings.append) is None
+    assert len(warnings) == 6 and all("starting over" in text for text in warnings)
+
+
+TRAINING = {"trainer": {}, "learner": {}, "selector": {}, "rounds_done": 0}
+
+
+def save_checkpoint(store: Store, key: str, stage: Stage, state: dict) -> None:
+    """Save ``state`` as the checkpoint of ``stage`` for ``key``, with a valid header."""
+    header = provenance.Header(
+        schema=provenance.SCHEMA,
+        stage=stage.name,
+        stage_version=stage.version,
+        libraries=provenance.libraries(),
+        attempts=(),
+    )
+    with store.working_on(key, wait=False) as scratch:
+        scratch.save(header.encode(to_bytes(state)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"training": {}},
+        {"training": []},
+        {"training": {**TRAINING, "trainer": []}},
+        {"training": {**TRAINING, "trainer": {"policy": {}, "optimizer": {}, "steps": 0}}},
+        {"training": {**TRAINING, "rounds_done": "x"}},
+        {"rows": torch.zeros(3, dtype=torch.uint8)},
+        {"rows": 7},
+    ],
+)
+def test_a_planted_checkpoint_is_named(irl, store_copy, changes):
+    """Valid tensors, header and checksum around a state that no stage wrote."""
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    (store.root / ".keys" / key).unlink()
+    rows = torch.frombuffer(bytearray(b"[]"), dtype=torch.uint8)
+    state = {"training": TRAINING, "rows": rows, **changes}
+    save_checkpoint(store, key, transfer.STAGE, state)
+    done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
+    assert_refused((done.code, done.out, done.err), 4, key)
+    shutil.rmtree(store.root / ".work" / key)
+    again = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
+    assert Path(again.out.strip()).name == store_copy.transfer
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"networks": {}},
+        {"optimizer": {"state": {}, "param_groups": []}},
+        {"records": []},
+        {"records": "x"},
+        {"iterations": "many"},
+    ],
+)
+def test_a_planted_gridworld_checkpoint_is_named(irl, maze_store, tmp_path, changes):
+    path = tmp_path / "runs"
+    shutil.copytree(maze_store, path, symlinks=True)
+    store = Store(path)
+    found = store.get(store.names()["maxent"]).manifest.record
+    (store.root / ".keys" / found.key).unlink()
+    state = {"iterations": 1, "networks": {}, "optimizer": {}, "records": [], **changes}
+    save_checkpoint(store, found.key, train_maxent.STAGE, state)
+    done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", path)
+    assert_refused((done.code, done.out, done.err), 4, found.key)
+
+
+def outside_checkpoint(store, key, outside):
+    (store.root / ".work" / key).mkdir()
+    (store.root / ".work" / key / "checkpoint").symlink_to(outside / "precious")
+
+
+def checkpoint_pipe(store, key, outside):
+    (store.root / ".work" / key).mkdir()
+    os.mkfifo(store.root / ".work" / key / "checkpoint")
+
+
+def checkpoint_directory(store, key, outside):
+    (store.root / ".work" / key / "checkpoint" / "below").mkdir(parents=True)
+
+
+def endless_checkpoint(store, key, outside):
+    (store.root / ".work" / key).mkdir()
+    with open(store.root / ".work" / key / "checkpoint", "wb") as file:
+        file.truncate(1 << 40)
+
+
+def odd_leftovers(store, key, outside):
+    node = os.uname().nodename
+    (store.root / ".work" / key).mkdir()
+    for pid in ("x", "9" * 40):
+        (store.root / ".work" / key / f"out.{pid}.{'0' * 32}.{node}").mkdir()
+    # 2 ** 22 is the largest process id of Linux.
+    (store.root / ".work" / key / f"out.{2**22 + 1}.{'0' * 32}.{node}").symlink_to(outside)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        outside_checkpoint,
+        checkpoint_pipe,
+        checkpoint_directory,
+        endless_checkpoint,
+        odd_leftovers,
+    ],
+)
+def test_links_pipes_and_strays_in_the_scratch_directory_are_not_followed(
+    irl, store_copy, tmp_path, plant
+):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_text("kept")
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    (store.root / ".keys" / key).unlink()
+    plant(store, key, outside)
+    done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
+    assert Path(done.out.strip()).name == store_copy.transfer, done.err
+    assert ("cannot be used" in done.err) == ("checkpoint" in plant.__name__)
+    assert (outside / "precious").read_text() == "kept"
+
+
+@pytest.mark.parametrize("name", [".keys", ".names", ".work", ".locks", ".quarantine"])
+def test_store_directories_that_are_links_are_not_followed(irl, store_copy, tmp_path, name):
+    outside = tmp_path / "outside"
+    (store_copy.path / name).rename(outside)
+    (store_copy.path / name).symlink_to(outside)
+    before = sorted(outside.rglob("*"))
+    for line in (["gc", "--delete", "--grace-days", "0"], [*CHAIN[2], *SMOKE, "--name", "x"]):
+        done = irl(*line, "--store", store_copy.path)
+        assert_refused((done.code, done.out, done.err), 4, f"{name} is a symbolic link")
+    assert sorted(outside.rglob("*")) == before
+
+
+def test_scratch_directories_locks_names_and_claims_that_are_links_are_not_followed(
+    irl, store_copy, tmp_path
+):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_text("kept" * 10)
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    claim, lock, work = (store.root / part / key for part in (".keys", ".locks", ".work"))
+    claim.unlink()
+    work.symlink_to(outside)
+    again = [*CHAIN[2], *SMOKE, "--store", store.root]
+    done = irl(*again)
+    assert_refused((done.code, done.out, done.err), 4, f"{work} is not a directory")
+    assert irl("gc", "--delete", "--grace-days", "0", "--store", store.root).code == 0
+    assert not work.is_symlink()
+    lock.unlink(missing_ok=True)
+    lock.symlink_to(outside / "precious")
+    assert irl(*again).code != 0
+    lock.unlink()
+    for pointer in (claim, store.root / ".names" / "led-out"):
+        pointer.symlink_to(outside / "precious")
+    assert irl("show", "led-out", "--store", store.root).code == 3
+    done = irl(*again)
+    assert Path(done.out.strip()).name == store_copy.transfer, done.err
+    assert (outside / "precious").read_text() == "kept" * 10
+
+
+def planted(store: Store, source: str, name: str, data: bytes) -> None:
+    """Replace ``source`` by an artefact with valid digests whose output ``name`` is ``data``."""
+    artefact = store.get(source)
+    record = artefact.manifest.record
+    files = {o.path: (artefact.directory / o.path).read_bytes() for o in artefact.manifest.outputs}
+    (store.root / ".keys" / record.key).unlink()
+    artefact.directory.chmod(0o755)
+    shutil.rmtree(artefact.directory)
+    with store.working_on(record.key, wait=False) as scratch:
+        output = scratch.new_output()
+        for path, content in {**files, name: data}.items():
+            (output / path).write_bytes(content)
+        store.publish(record, output, {"command": ["irl"]})
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"{}",
+        b"[]",
+        b'{"settings":[{}]}',
+        b'{"settings":[{"setting":1}]}',
+        b'{"settings":{"a":1}}',
+        b'{"settings":[{"setting":"x","seen":true,"goal_probability":"high","true_return":null,'
+        b'"value_difference":null,"rank_correlation":null,"log_likelihood":0}]}',
+    ],
+)
+@pytest.mark.parametrize(
+    ("name", "file", "line"),
+    [("mazes", "summary.json", GRIDWORLD[0]), ("maxent", "quality.json", GRIDWORLD[1])],
+)
+def test_planted_summaries_are_checked(irl, maze_store, tmp_path, name, file, line, data):
+    """A hit prints them beside its artefact's path."""
+    path = tmp_path / name
+    shutil.copytree(maze_store, path, symlinks=True)
+    store = Store(path)
+    planted(store, store.names()[name], file, data)
+    done = irl(*line, *SMOKE, "--quiet", "--store", path)
+    assert Path(done.out.strip()).parent == path  # The artefact itself exists.
+    assert_refused((done.code, "", done.err), 4, file)
