@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from irlcli.envs.gridworld.env import gridworld
-from irlcli.learners.maxent import solve
+from irlcli.learners.soft_values import solve
 from irlcli.tabular import dense_transitions, stack
 
 SIZE, HORIZON, RUNS = 32, 128, 20

@@ -9,9 +9,9 @@ from irlcli.report.tables import markdown_table
 
 def quality(variant, setting, seen, values, **more):
     """A row per dataset; every measure has the same value."""
-    given = {"method": "erm", "penalty": "irmv1", "penalty_weight": 0.0, "l2": 0.0} | more
+    given = {"grouping": "pooled", "penalty": "none", "penalty_weight": 0.0, "l2": 0.0} | more
     return [
-        {"variant": variant, "shuffled": False, **given, "seed": seed, "setting": setting}
+        {"variant": variant, **given, "seed": seed, "setting": setting}
         | {"seen": seen, **dict.fromkeys(MEASURES, value)}
         for seed, value in enumerate(values)
     ]
@@ -27,13 +27,13 @@ def test_worst_is_taken_within_each_dataset_and_among_trained_settings():
     assert found["c", "log_likelihood"] == -9.0
 
 
-def test_a_reward_that_ranks_nothing_counts_as_zero():
+def test_an_undefined_rank_correlation_counts_as_zero():
     found = summary(pd.DataFrame(quality("erm", "a", True, [np.nan, 1.0])))
     means = found.set_index(["setting", "measure"])["mean"]
     assert means["a", "rank_correlation"] == 0.5
 
 
-def test_table_has_a_row_a_variant():
+def test_table_has_a_row_per_variant():
     rows = quality("erm", "a", True, [1.0, 1.0]) + quality("erm", "c", False, [0.25, 0.25])
     columns, body = table(summary(pd.DataFrame(rows)), ["c"])
     assert columns[:3] == ["method", "goal probability, worst trained", "goal probability, c"]
@@ -45,12 +45,12 @@ def test_table_has_a_row_a_variant():
     ]
 
 
-def test_curves_start_at_weight_zero_and_leave_the_control_out():
+def test_curves_start_at_weight_zero_and_omit_the_control():
     rows = quality("erm", "a", True, [1.0]) + quality("erm l2 0.1", "a", True, [1.0], l2=0.1)
-    rows += quality("erm-balanced", "a", True, [1.0], method="erm-balanced")
-    irm = {"method": "irm", "penalty": "closed-form", "penalty_weight": 0.05}
-    rows += quality("irm closed-form 0.05", "a", True, [1.0], **irm)
-    rows += quality("irm closed-form 0.05 shuffled", "a", True, [1.0], **irm, shuffled=True)
+    rows += quality("erm-balanced", "a", True, [1.0], grouping="balanced")
+    for grouping, variant in (("per-setting", "irm"), ("shuffled", "irm-shuffled")):
+        penalised = {"grouping": grouping, "penalty": "closed-form", "penalty_weight": 0.05}
+        rows += quality(f"{variant} closed-form 0.05", "a", True, [1.0], **penalised)
     assert curves(pd.DataFrame(rows)) == {
         "IRM closed-form": [(0.0, "erm-balanced"), (0.05, "irm closed-form 0.05")],
         "ERM + L2": [(0.0, "erm"), (0.1, "erm l2 0.1")],
