@@ -11,7 +11,7 @@ import pytest
 from test_architecture import loaded_by
 
 from irlcli.configs import load_config
-from irlcli.experiments.matrix import EXPERIMENTS
+from irlcli.experiments.tables import load_tables
 from irlcli.store import Store
 from irlcli.store.manifest import encode_provenance
 

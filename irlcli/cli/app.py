@@ -22,6 +22,8 @@ COMMANDS = {
     "transfer": ("transfer", "Train a new policy on a frozen reward in an unseen setting."),
     "evaluate": ("evaluate", "Measure the return of a policy, an expert or a baseline."),
     "play": ("play", "Draw a policy as a GIF, several settings side by side."),
+    "plan": ("experiments", "Show what exists and what is missing of a table, and why."),
+    "run": ("experiments", "Make what is missing of a table, several at a time, and report."),
     "report": ("report", "Print or write a table or figure from stored results."),
     "ls": ("artefacts", "List the artefacts."),
     "show": ("artefacts", "Show an artefact: its stage, parameters, inputs and outputs."),

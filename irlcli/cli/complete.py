@@ -45,3 +45,10 @@ def profiles(incomplete: str) -> list[str]:
     from irlcli.configs import PROFILES
 
     return list(PROFILES)
+
+
+def tables(incomplete: str) -> list[tuple[str, str]]:
+    """Names of tables and figures, with their titles."""
+    from irlcli.experiments.tables import load_tables
+
+    return [(table.name, table.title) for table in load_tables().values()]

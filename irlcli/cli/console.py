@@ -43,6 +43,15 @@ class TerminalConsole:
             _require_tensorboard(tensorboard)
         self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
 
+    @property
+    def is_live(self) -> bool:
+        """Whether a live display can be drawn."""
+        return self._rich
+
+    def share(self, live: Any) -> None:
+        """Print above the live display of somebody else; None when that has ended."""
+        self._live = live
+
     def start(self, label: str, resumed: bool) -> None:
         """A stage begins; ``resumed`` if from a checkpoint."""
         self._label = label
@@ -58,7 +67,7 @@ class TerminalConsole:
             # A resumed stage did not do its first steps in this process.
             self._first_done, self._started = done, now
         rate = (done - self._first_done) / (now - self._started) if now > self._started else 0.0
-        left = f"{_duration((total - done) / rate)} left" if rate > 0 else ""
+        left = f"{duration((total - done) / rate)} left" if rate > 0 else ""
         speed = f"{rate:,.0f} {unit}/s" if rate >= 10 else ""
         parts = [speed, left, *(f"{name} {fact}" for name, fact in facts.items())]
         detail = "  ".join(p for p in parts if p)
@@ -95,6 +104,11 @@ class TerminalConsole:
             self._writer.close()
             self._writer = None
         self.say(f"{'HIT' if hit else 'DONE'} {label}: {artefact.directory}")
+
+    def found(self, label: str, artefact: Artefact, where: Path) -> None:
+        """An artefact was copied from the store ``where``."""
+        self._close_live()
+        self.say(f"FOUND {label}: {artefact.directory}, copied from {where}")
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -228,7 +242,8 @@ def _shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """``1:23`` or ``1:02:03``."""
     minutes, seconds = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"

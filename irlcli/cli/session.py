@@ -91,16 +91,19 @@ class StageSession(Session):
         super().__init__(store, as_json, out.TerminalConsole(quiet, tensorboard), wait)
         self.profile = profile
         self.file = file
+        # Settings file of a table, which --settings replaces.
+        self.table_file: Path | None = None
         self.overrides = list(overrides)
         self.sources = list(sources)
         self.dry_run = dry_run
         self.workers = workers
+        self.tensorboard = tensorboard
 
     def config(self, env: str, flags: dict[str, Any] | None = None) -> "Config":
         """The config of ``env`` under this session's profile and overrides."""
         from irlcli.configs import load_config
 
-        return load_config(env, self.profile, self.file, self.overrides, flags)
+        return load_config(env, self.profile, self.file or self.table_file, self.overrides, flags)
 
     def config_words(self) -> list[str]:
         """The options that give another command line the same configs."""
@@ -108,12 +111,35 @@ class StageSession(Session):
         words += [] if self.file is None else ["--settings", str(self.file)]
         return words + [word for item in self.overrides for word in ("--set", item)]
 
+    def place_words(self) -> list[str]:
+        """The options that give another command line the same stores and the same way to work."""
+        words = ["--store", str(self.store.root)]
+        words += [word for source in self.sources for word in ("--from", str(source))]
+        words += [] if self.workers == 1 else ["--workers", str(self.workers)]
+        words += [] if self.tensorboard is None else ["--tensorboard", str(self.tensorboard)]
+        return words if self.wait else [*words, "--no-wait"]
+
     def runner(self) -> "Runner":
-        """A runner on the session's store."""
+        """A runner on the session's store and those to copy from.
+
+        Raises:
+            NotFound: a directory given by ``--from`` is not a store.
+        """
         from irlcli.experiments.runner import Runner
 
-        command = ["irl", *sys.argv[1:]]
-        return Runner(self.store, self.console, self.wait, command, workers=self.workers)
+        sources = []
+        if self.sources:
+            from irlcli.store.substitute import open_sources
+
+            sources = open_sources(self.sources, self.console.warn)
+        return Runner(
+            self.store,
+            self.console,
+            self.wait,
+            ["irl", *sys.argv[1:]],
+            workers=self.workers,
+            sources=sources,
+        )
 
     def deliver(
         self,
@@ -150,7 +176,7 @@ class StageSession(Session):
             if name is not None:
                 self.name(name, artefacts[0])
         for artefact in artefacts:
-            self._print_artefact(artefact, name, details)
+            self.print_artefact(artefact, name, details)
         return artefacts
 
     def prepare(self, request: "Request", then: str) -> Artefact | None:
@@ -180,12 +206,13 @@ class StageSession(Session):
         for step in steps:
             out.print_data(f"{step.status:8}{step.label}: {step.why}")
 
-    def _print_artefact(
+    def print_artefact(
         self,
         artefact: Artefact,
         name: str | None,
-        details: Callable[[Artefact], Mapping[str, Any]] | None,
+        details: Callable[[Artefact], Mapping[str, Any]] | None = None,
     ) -> None:
+        """A line with the artefact's directory, or a JSON document."""
         if not self.as_json:
             out.print_data(str(artefact.directory))
             return

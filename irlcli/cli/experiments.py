@@ -1,0 +1,242 @@
+"""``irl plan`` and ``irl run``: the tables and figures of ``settings/experiments.toml``."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from irlcli.cli import complete
+from irlcli.cli import console as out
+from irlcli.cli.options import stage_command
+from irlcli.cli.session import StageSession
+from irlcli.cli.tables import Choice, copy_outputs, open_plan, print_report, report_of
+from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
+
+if TYPE_CHECKING:
+    from irlcli.experiments.execute import Outcome
+    from irlcli.experiments.plan import Plan
+    from irlcli.experiments.runner import Runner
+
+_TableName = Annotated[
+    str, typer.Argument(metavar="TABLE", help="e.g. table1.", autocompletion=complete.tables)
+]
+Seeds = Annotated[str | None, typer.Option(help="Seeds of the reward learning, e.g. 0,1,2.")]
+Methods = Annotated[str | None, typer.Option(help="Methods to compare, e.g. erm,irm.")]
+RowsEnv = Annotated[str | None, typer.Option(help="Only the rows of this environment.")]
+ChoosePenalty = Annotated[
+    str | None,
+    typer.Option(help="Candidates for lambda, e.g. 0.1,1,10: chosen by leaving a setting out."),
+]
+_Until = Annotated[
+    str | None,
+    typer.Option(help="Last phase: experts, demos, rewards, transfers or returns. No report."),
+]
+_Only = Annotated[str | None, typer.Option(metavar="NAME", help="One step and what it needs.")]
+_Tag = Annotated[str | None, typer.Option(help="What all names begin with. Default: the profile.")]
+TableFile = Annotated[
+    Path | None, typer.Option("--experiments", help="Tables, instead of settings/experiments.toml.")
+]
+
+
+@stage_command
+def plan(
+    session: StageSession,
+    table: _TableName,
+    seeds: Seeds = None,
+    methods: Methods = None,
+    env: RowsEnv = None,
+    choose_penalty: ChoosePenalty = None,
+    until: _Until = None,
+    only: _Only = None,
+    tag: _Tag = None,
+    experiments: TableFile = None,
+) -> None:
+    """Show which steps of a table exist and which are missing, and why.
+
+    HIT: in the store. FOUND: in a store of --from. RUN: can be computed now. RESUME: can be
+    resumed. BLOCKED: waits for other steps. Nothing is computed, written or moved.
+    """
+    choice = Choice(table, seeds, methods, env, choose_penalty, until, only, tag, experiments)
+    _print_plan(session, choice, open_plan(session, choice))
+
+
+def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
+    command = _child_words(session, choice, found)
+    steps = {name: found.step(name) for name in found.tasks}
+    counts = found.counts()
+    if session.as_json:
+        document = [
+            {
+                "name": name,
+                "key": step.key,
+                "status": step.status,
+                "request": step.label,
+                "why": step.why,
+                "needs": list(found.needs[name]),
+                "command": ["irl", *command(name)],
+            }
+            for name, step in steps.items()
+        ]
+        out.print_json("plan", {"table": choice.table, "counts": counts, "steps": document})
+        return
+    for name, step in steps.items():
+        out.print_data(f"{step.status:8}{name}: {step.why}")
+    parts = [f"{count} {status}" for status, count in counts.items() if count]
+    out.print_note(f"{len(steps)} steps: {', '.join(parts)}")
+
+
+@stage_command
+def run(
+    session: StageSession,
+    table: _TableName,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 1,
+    seeds: Seeds = None,
+    methods: Methods = None,
+    env: RowsEnv = None,
+    choose_penalty: ChoosePenalty = None,
+    until: _Until = None,
+    only: _Only = None,
+    tag: _Tag = None,
+    experiments: TableFile = None,
+    directory: Annotated[
+        Path | None, typer.Option("--out", help="Directory to copy the report's files to.")
+    ] = None,
+) -> None:
+    """Make what is missing of a table, several steps at a time, then its report.
+
+    Each missing step is made by a process of its own: this command with --only NAME. Run it again
+    after a failure or an interruption: finished steps are kept, interrupted ones resume.
+    """
+    choice = Choice(table, seeds, methods, env, choose_penalty, until, only, tag, experiments)
+    if session.dry_run:
+        _print_plan(session, choice, open_plan(session, choice))
+        return
+    if tag is None and (session.file or session.overrides or choose_penalty is not None):
+        raise UsageError(
+            "--settings, --set and --choose-penalty make other artefacts than the profile alone",
+            "name them: --tag NAME",
+        )
+    if only is not None and (until is not None or directory is not None):
+        raise UsageError("--only takes no --until and no --out", "it makes one step")
+    if until is not None and directory is not None:
+        raise UsageError("--until makes no report, so --out has no files", "omit one of them")
+    runner = session.runner()
+    runner.store.create()
+    with session.reading():
+        found = open_plan(session, choice)
+        for name in found.tasks:
+            runner.store.check_name(name)
+        if only is not None:
+            _make_one(session, runner, found, only)
+            return
+        outcome = _make_all(session, runner, found, choice, jobs)
+        if not outcome.interrupted and until is None:
+            _report(session, runner, found, choice, directory, outcome)
+    _raise_for(outcome, found)
+
+
+def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str) -> None:
+    """Make one step and what it needs in this process, inputs first."""
+    try:
+        # In a choice of lambda what follows is known only when the choice was made.
+        for name in list(found.tasks):
+            artefact = runner.run(found.tasks[name].request)
+            runner.name(name, artefact)
+            if name != only and found.selection.candidates:
+                found.refresh()
+    finally:
+        session.console.close()
+    session.print_artefact(artefact, only)
+
+
+def _make_all(
+    session: StageSession, runner: "Runner", found: "Plan", choice: Choice, jobs: int
+) -> "Outcome":
+    from irlcli.cli.jobs import job_display
+    from irlcli.experiments.execute import execute
+
+    words = _child_words(session, choice, found)
+    display = job_display(session.console)
+
+    def command(name: str) -> list[str]:
+        return [sys.executable, "-m", "irlcli", *words(name)]
+
+    try:
+        return execute(found, runner, command, jobs, display)
+    finally:
+        display.close()
+
+
+def _child_words(
+    session: StageSession, choice: Choice, found: "Plan"
+) -> Callable[[str], list[str]]:
+    """The command line that makes one step, by its name."""
+    words = [*session.config_words(), *choice.words(), "--tag", found.selection.tag]
+    words += session.place_words()
+
+    def command(name: str) -> list[str]:
+        return ["run", choice.table, "--only", name, *words]
+
+    return command
+
+
+def _report(
+    session: StageSession,
+    runner: "Runner",
+    found: "Plan",
+    choice: Choice,
+    directory: Path | None,
+    outcome: "Outcome",
+) -> None:
+    found.lookup.forget_missing()
+    try:
+        request = report_of(session, choice, found)
+    except NotFound:
+        if outcome.failed:
+            # The failures are reported, and they are the reason.
+            return
+        raise
+    try:
+        artefact = runner.run(request)
+    finally:
+        session.console.close()
+    suffix = "" if choice.env is None else f"-{choice.env}"
+    name = f"{found.selection.tag}.{choice.table}{suffix}"
+    runner.name(name, artefact)
+    if directory is not None:
+        copy_outputs(session, artefact, directory)
+    session.print_artefact(artefact, name)
+    if not session.as_json:
+        print_report(session, artefact, choice.table)
+
+
+def _raise_for(outcome: "Outcome", found: "Plan") -> None:
+    """End with the exit code of what went wrong.
+
+    Raises:
+        IrlError: a step failed, or a signal stopped the run.
+    """
+    if not outcome.exit_code:
+        return
+    total = len(found.tasks)
+    there = len(outcome.existed) + len(outcome.copied) + len(outcome.made)
+    if outcome.interrupted:
+        error: IrlError = Interrupted(
+            f"stopped: {there} of {total} steps exist", "run the same command again to continue"
+        )
+    else:
+        names = ", ".join(list(outcome.failed)[:3])
+        names += f" and {len(outcome.failed) - 3} more" if len(outcome.failed) > 3 else ""
+        waiting = f"; {len(outcome.blocked)} wait for them" if outcome.blocked else ""
+        error = StageFailed(
+            f"{len(outcome.failed)} of {total} steps failed: {names}{waiting}",
+            "fix the problem and run the same command again: finished steps are kept",
+        )
+        error.details = {
+            "failed": {name: failure._asdict() for name, failure in outcome.failed.items()},
+            "blocked": outcome.blocked,
+        }
+    error.exit_code = outcome.exit_code
+    raise error

@@ -1,0 +1,99 @@
+"""Checkpoints of a stage at work: saved at intervals, and when a signal asks it to stop."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from irlcli.errors import Interrupted
+from irlcli.experiments import provenance
+from irlcli.stages.base import Stage
+from irlcli.store import Scratch
+
+
+class StageCheckpoints:
+    """The checkpoints of one attempt at ``stage``.
+
+    A checkpoint that this program cannot resume is discarded with a warning.
+
+    Args:
+        stage: the stage at work.
+        scratch: where the checkpoint lies.
+        console: receives warnings.
+        seconds: least time between two checkpoints [s].
+    """
+
+    def __init__(self, stage: Stage, scratch: Scratch, console: Any, seconds: float):
+        self._stage = stage
+        self._libraries = provenance.libraries()
+        self._clock = provenance.Clock()
+        self._earlier: tuple[provenance.Attempt, ...] = ()
+        self._scratch = scratch
+        self._console = console
+        self._seconds = seconds
+        self._last = time.monotonic()
+        self.stop_requested = False
+        self._state: bytes | None = None
+        try:
+            stored = scratch.load()
+            if stored is not None:
+                header, self._state = provenance.decode(stored, stage.name, stage.version)
+                self._earlier = header.attempts
+        except ValueError as error:
+            console.warn(f"the checkpoint cannot be used ({error}): starting over")
+            scratch.discard_checkpoint()
+
+    def load(self) -> bytes | None:
+        """The state to resume from; None at the first attempt."""
+        return self._state
+
+    def attempts(self) -> tuple[provenance.Attempt, ...]:
+        """All attempts at this artefact so far, the present one last."""
+        return (*self._earlier, self._clock.attempt())
+
+    def offer(self, state: Callable[[], bytes]) -> None:
+        """Save ``state()`` if a checkpoint is due or a stop was requested.
+
+        Raises:
+            Interrupted: a stop was requested; the state has been saved.
+        """
+        now = time.monotonic()
+        if self.stop_requested or now - self._last >= self._seconds:
+            header = provenance.Header(
+                schema=provenance.SCHEMA,
+                stage=self._stage.name,
+                stage_version=self._stage.version,
+                libraries=self._libraries,
+                attempts=self.attempts(),
+            )
+            self._scratch.save(header.encode(state()))
+            self._last = now
+        if self.stop_requested:
+            raise Interrupted(
+                "stopped; a checkpoint was written", "run the same command again to resume"
+            )
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Let SIGINT or SIGTERM request a stop at the end of the round; a second one stops at once."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def handle(number: int, frame: FrameType | None) -> None:
+            if self.stop_requested:
+                raise KeyboardInterrupt
+            self.stop_requested = True
+            self._console.warn(
+                "stopping at the end of this round (repeat the signal to stop at once)"
+            )
+
+        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)

@@ -1,0 +1,290 @@
+"""Makes what a plan is missing: one process per missing artefact, several at a time.
+
+A step whose inputs exist is started; one that exists already, here or in another store, needs no
+process. A failed step stops only what depends on it.
+"""
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from queue import Empty, SimpleQueue
+from types import FrameType
+from typing import NamedTuple, Protocol
+
+from irlcli.experiments.plan import Plan
+from irlcli.experiments.runner import Runner
+from irlcli.stages import choose_penalty
+from irlcli.store import Artefact
+
+_POLL_SECONDS = 0.05
+# From the mildest to the worst: busy, killed, missing reference, usage, failed, integrity.
+_SEVERITY = (75, 141, 130, 3, 2, 1, 4)
+
+
+class Failure(NamedTuple):
+    """Why a step failed: the exit code of its process, its error line and its hint."""
+
+    code: int
+    message: str
+    hint: str
+
+
+class Outcome(NamedTuple):
+    """What became of the steps, by name."""
+
+    existed: list[str]
+    copied: list[str]
+    made: list[str]
+    failed: dict[str, Failure]
+    blocked: list[str]
+    interrupted: bool
+
+    @property
+    def exit_code(self) -> int:
+        """That of the worst failure; 0 without one, 130 if a signal stopped the run."""
+        if self.interrupted:
+            return 130
+        codes = {failure.code for failure in self.failed.values()}
+        return max(codes, key=lambda c: _SEVERITY.index(c) if c in _SEVERITY else 5, default=0)
+
+
+class Display(Protocol):
+    """What is shown while steps are made."""
+
+    def begin(self, total: int, done: int) -> None:
+        """``done`` of ``total`` steps exist at the start."""
+
+    def start(self, name: str) -> None:
+        """A process was started for a step."""
+
+    def line(self, name: str, text: str) -> None:
+        """A line that the process wrote to stderr."""
+
+    def copied(self, name: str, why: str) -> None:
+        """A step's artefact was copied from another store."""
+
+    def done(self, name: str, seconds: float) -> None:
+        """A step's artefact exists now."""
+
+    def failed(self, name: str, failure: Failure) -> None:
+        """A step failed."""
+
+    def stopping(self) -> None:
+        """A signal asked to stop; running steps write a checkpoint."""
+
+
+class _Child:
+    """A process that makes one step."""
+
+    def __init__(self, name: str, command: Sequence[str], lines: SimpleQueue):
+        self.name = name
+        self.started = time.monotonic()
+        self.last: list[str] = []
+        # A process group of its own: Ctrl-C on the terminal reaches it through this process only.
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            process_group=0,
+        )
+        self._reader = threading.Thread(target=self._read, args=(lines,), daemon=True)
+        self._reader.start()
+
+    def _read(self, lines: SimpleQueue) -> None:
+        assert self.process.stderr is not None
+        for raw in self.process.stderr:
+            text = raw.decode("utf-8", "replace").rstrip()
+            self.last = [*self.last[-20:], text]
+            lines.put((self.name, text))
+
+    def stop(self, at_once: bool) -> None:
+        """Ask for a stop at the next checkpoint, or kill it with all that it started."""
+        if self.process.poll() is not None:
+            return
+        if at_once:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        else:
+            self.process.send_signal(signal.SIGTERM)
+
+    def failure(self) -> Failure:
+        """Why it failed, after its end."""
+        # What it started may keep the pipe open.
+        self._reader.join(timeout=1.0)
+        code = self.process.returncode
+
+        def after(prefix: str) -> str:
+            found = [text for text in self.last if text.startswith(prefix)]
+            return found[-1].removeprefix(prefix) if found else ""
+
+        if code < 0:
+            reason = f"its process was killed by signal {-code}"
+            return Failure(1, reason, "run the same command again: it resumes")
+        message = after("error: ") or (self.last[-1] if self.last else f"exit code {code}")
+        return Failure(code, message, after("hint: "))
+
+
+def execute(
+    plan: Plan,
+    runner: Runner,
+    command: Callable[[str], Sequence[str]],
+    jobs: int,
+    display: Display,
+) -> Outcome:
+    """Make the missing steps of ``plan``, ``jobs`` at a time, and name all artefacts.
+
+    Args:
+        plan: what to make.
+        runner: copies from other stores; runs no stage here.
+        command: the command line of the process that makes the step of that name.
+        jobs: processes at a time.
+        display: receives what happens.
+    """
+    return _Execution(plan, runner, command, jobs, display).run()
+
+
+class _Execution:
+    def __init__(
+        self,
+        plan: Plan,
+        runner: Runner,
+        command: Callable[[str], Sequence[str]],
+        jobs: int,
+        display: Display,
+    ):
+        self._plan = plan
+        self._runner = runner
+        self._command = command
+        self._jobs = jobs
+        self._display = display
+        self._waiting = list(plan.tasks)
+        self._done: set[str] = set()
+        self._running: dict[str, _Child] = {}
+        self._lines: SimpleQueue = SimpleQueue()
+        self._signals = 0
+        self._passed_on = 0
+        self._outcome = Outcome([], [], [], {}, [], False)
+
+    def run(self) -> Outcome:
+        there = [name for name in self._waiting if self._plan.step(name).status == "HIT"]
+        for name in there:
+            self._finish(name)
+        self._outcome.existed.extend(there)
+        self._display.begin(len(self._plan.tasks), len(there))
+        if self._waiting:
+            with self._listening():
+                try:
+                    self._loop()
+                finally:
+                    for child in self._running.values():
+                        child.stop(at_once=True)
+        return self._outcome._replace(blocked=self._waiting, interrupted=self._signals > 0)
+
+    def _loop(self) -> None:
+        while True:
+            if not self._signals:
+                self._start_ready()
+            if self._signals:
+                self._stop()
+            if not self._running:
+                return
+            self._show_lines()
+            for child in list(self._running.values()):
+                if child.process.poll() is not None:
+                    self._end(child)
+
+    def _start_ready(self) -> None:
+        for name in list(self._waiting):
+            if len(self._running) >= self._jobs or self._signals:
+                return
+            if not self._done.issuperset(self._plan.needs[name]):
+                continue
+            status = self._plan.step(name).status
+            if status == "HIT":
+                self._finish(name)
+                self._outcome.existed.append(name)
+                self._display.done(name, 0.0)
+            elif status == "FOUND" and self._copy(name):
+                self._finish(name)
+                self._outcome.copied.append(name)
+            else:
+                self._waiting.remove(name)
+                self._running[name] = _Child(name, self._command(name), self._lines)
+                self._display.start(name)
+
+    def _copy(self, name: str) -> bool:
+        why = self._plan.step(name).why
+        copied = self._runner.copy(self._plan.tasks[name].request, self._plan.lookup)
+        self._plan.lookup.forget_missing()
+        if copied is not None:
+            self._display.copied(name, why)
+        return copied is not None
+
+    def _end(self, child: _Child) -> None:
+        del self._running[child.name]
+        self._show_lines()
+        if child.process.returncode == 0:
+            self._plan.lookup.forget_missing()
+            if self._plan.tasks[child.name].request.stage == choose_penalty.STAGE:
+                self._plan.refresh()
+            if self._plan.step(child.name).status == "HIT":
+                self._finish(child.name)
+                self._outcome.made.append(child.name)
+                self._display.done(child.name, time.monotonic() - child.started)
+                return
+            failure = Failure(1, "its process ended, but the artefact is missing", "")
+        else:
+            failure = child.failure()
+        if self._signals:
+            self._waiting.append(child.name)
+            return
+        self._outcome.failed[child.name] = failure
+        self._display.failed(child.name, failure)
+
+    def _finish(self, name: str) -> None:
+        if name in self._waiting:
+            self._waiting.remove(name)
+        self._done.add(name)
+        artefact: Artefact | None = self._plan.step(name).artefact
+        if artefact is not None:
+            self._runner.name(name, artefact)
+
+    def _show_lines(self) -> None:
+        """Pass on what the processes wrote; wait a moment if they wrote nothing."""
+        try:
+            name, text = self._lines.get(timeout=_POLL_SECONDS)
+            while True:
+                self._display.line(name, text)
+                name, text = self._lines.get_nowait()
+        except Empty:
+            pass
+
+    def _stop(self) -> None:
+        """Pass the signals on that the processes have not had yet."""
+        if not self._passed_on:
+            self._display.stopping()
+        for child in self._running.values():
+            if self._passed_on < min(self._signals, 2):
+                child.stop(at_once=self._signals > 1)
+        self._passed_on = min(self._signals, 2)
+
+    @contextmanager
+    def _listening(self) -> Iterator[None]:
+        """Let SIGINT or SIGTERM ask the processes to stop; a second one kills them."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def handle(number: int, frame: FrameType | None) -> None:
+            self._signals += 1
+
+        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)

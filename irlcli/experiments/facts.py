@@ -1,0 +1,112 @@
+"""What a report prints of its artefacts' provenance, and which similar runs it leaves out."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from irlcli.experiments.references import flat
+from irlcli.methods import method_name
+from irlcli.report.parameters import Code, Others, Run
+from irlcli.store import Artefact, KeyRecord, digest
+
+_Subject = tuple[Any, ...]
+
+
+def runs(
+    artefacts: Iterable[Artefact],
+) -> tuple[dict[str, Run], dict[str, dict[str, str | None]]]:
+    """The provenance of each artefact by id, and the sets of library versions that occur."""
+    found, libraries = {}, {}
+    for artefact in sorted(artefacts, key=lambda a: a.id):
+        origin = artefact.provenance()
+        git = origin.get("git") or {}
+        versions = {"python": origin.get("python"), **(origin.get("libraries") or {})}
+        name = digest(versions)[:8]
+        libraries[name] = versions
+        record = artefact.manifest.record
+        found[artefact.id] = Run(
+            stage=record.stage,
+            about=_subject_text(record),
+            code=tuple(dict.fromkeys(_code(state) for state in origin.get("attempts") or [git])),
+            libraries=name,
+            seconds=origin.get("seconds"),
+            resumed=origin.get("resumed"),
+            inputs=tuple(sorted(set(_ids(origin.get("inputs") or {})))),
+        )
+    return found, libraries
+
+
+def _code(state: Mapping[str, Any]) -> Code:
+    return Code(commit=state.get("commit"), dirty=state.get("dirty"))
+
+
+def _ids(inputs: Mapping[str, str]) -> Iterator[str]:
+    for place in inputs.values():
+        yield place.partition("/")[0]
+
+
+def left_out(
+    artefacts: Iterable[Artefact], wanted: Iterable[KeyRecord], used: set[str]
+) -> list[Others]:
+    """Artefacts on the same subject as a ``wanted`` one, but with other parameters or inputs.
+
+    They are grouped by how they differ. ``used`` are the ids of those that the report does use.
+    """
+    expected = {_subject(record): record for record in wanted}
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for artefact in artefacts:
+        record = artefact.manifest.record
+        sought = expected.get(_subject(record))
+        if sought is None or artefact.id in used:
+            continue
+        group = record.stage, _subject_text(record), _difference(record, sought)
+        groups.setdefault(group, []).append(artefact.id)
+    return [
+        Others(stage=stage, about=about, why=why, ids=tuple(ids))
+        for (stage, about, why), ids in sorted(groups.items())
+    ]
+
+
+def _subject(record: KeyRecord) -> _Subject:
+    """What an artefact is about. A report never mixes two that differ in anything else."""
+    parameters = record.parameters
+    places = parameters.get("settings", parameters.get("setting"))
+    return (
+        record.stage,
+        _env(parameters),
+        tuple(places) if isinstance(places, list | tuple) else places,
+        _method(parameters),
+        parameters.get("agent"),
+        # The seed of an evaluation is a parameter like another. Those of other stages tell
+        # repetitions apart.
+        parameters.get("seed") if record.stage != "evaluate" else None,
+        tuple(sorted(record.inputs.values())) if record.stage in ("transfer", "evaluate") else None,
+    )
+
+
+def _subject_text(record: KeyRecord) -> str:
+    _, env, places, method, agent, *_ = _subject(record)
+    texts = [places] if isinstance(places, str) else list(places or ())
+    return " ".join(str(t) for t in (env, *texts, method, agent) if t and t != "policy")
+
+
+def _env(parameters: Mapping[str, Any]) -> str | None:
+    environment = parameters.get("environment")
+    return environment.get("name") if isinstance(environment, dict) else parameters.get("env")
+
+
+def _method(parameters: Mapping[str, Any]) -> str | None:
+    learner = parameters.get("airl")
+    if not isinstance(learner, dict):
+        return None
+    return method_name(*(str(learner.get(f)) for f in ("learner", "grouping", "penalty")))
+
+
+def _difference(found: KeyRecord, sought: KeyRecord) -> str:
+    if found.stage_version != sought.stage_version:
+        return f"version {found.stage_version} of the stage instead of {sought.stage_version}"
+    here, there = dict(flat(found.parameters)), dict(flat(sought.parameters))
+    names = sorted(n for n in here | there if here.get(n) != there.get(n))
+    parts = [f"{n} {here.get(n, 'unset')} instead of {there.get(n, 'unset')}" for n in names]
+    if not parts:
+        return "other inputs"
+    return ", ".join(parts[:4]) + (f" and {len(parts) - 4} more" if len(parts) > 4 else "")

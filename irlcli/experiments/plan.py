@@ -1,0 +1,202 @@
+"""A table as a list of named steps, and what a store holds of each."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import msgspec
+
+from irlcli.configs import Config
+from irlcli.errors import NotFound, UsageError, closest
+from irlcli.experiments import rows
+from irlcli.experiments.rows import PHASES, Chosen, Configs, Task
+from irlcli.experiments.status import STATUSES, Lookup, Step
+from irlcli.experiments.tables import Row, Table
+from irlcli.stages.base import From, Request
+from irlcli.store import digest
+
+
+class Selection(NamedTuple):
+    """Which part of a table, under which names.
+
+    Attributes:
+        tag: what all names begin with.
+        candidates: for lambda; empty if it is not to be chosen.
+        until: the last phase.
+        only: one step and what it needs.
+    """
+
+    tag: str
+    candidates: Sequence[float] = ()
+    until: rows.Phase = PHASES[-1]
+    only: str | None = None
+
+
+class Plan:
+    """The steps of ``table``, each after what it needs.
+
+    Attributes:
+        tasks: by name, which begins with the tag. Equal requests are one task.
+        needs: for each name, the names of what it is made from.
+        cells: all tasks that fill a cell of the report, equal requests included.
+        figure: the request that draws the result, for tables without a report of cells.
+
+    Raises:
+        UsageError: a setting that a row needs is missing, or ``only`` names no step.
+    """
+
+    def __init__(self, table: Table, selection: Selection, configs: Configs, lookup: Lookup):
+        self.table = table
+        self.selection = selection
+        self.lookup = lookup
+        self._configs = _cached(configs)
+        self.figure: Request | None = None
+        self.tasks: dict[str, Task] = {}
+        self.needs: dict[str, tuple[str, ...]] = {}
+        self.cells: list[Task] = []
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Make the tasks again, from what the store holds now: a lambda may have been chosen."""
+        self.lookup.forget_missing()
+        self.tasks, self.needs, self.cells = {}, {}, []
+        names: dict[str, str] = {}
+        identities = _Identities()
+        last = PHASES.index(self.selection.until)
+        for task in self._all_tasks():
+            if PHASES.index(task.phase) > last:
+                continue
+            name = f"{self.selection.tag}.{task.name}"
+            if task.cell is not None:
+                self.cells.append(task)
+            identity = identities(task.request)
+            if identity in names:
+                continue
+            names[identity] = name
+            self.tasks[name] = task
+            self.needs[name] = tuple(
+                dict.fromkeys(
+                    names[identities(source.request)]
+                    for source in task.request.inputs.values()
+                    if isinstance(source, From)
+                )
+            )
+        if self.selection.only is not None:
+            self._keep_only(self.selection.only)
+
+    def _all_tasks(self) -> Iterator[Task]:
+        if self.table.kind == "figure2":
+            tasks, self.figure = rows.gridworld_figure(self._configs)
+            yield from tasks
+        for row in self.table.rows:
+            if not self._may_hold(f"{row}."):
+                continue
+            if self.table.kind == "experts":
+                yield from rows.experts(row, self._configs)
+                continue
+            yield from rows.comparison(
+                row,
+                self.table.measures,
+                self._runs(row),
+                self._configs,
+                Chosen(self.selection.candidates, self.lookup),
+            )
+
+    def _runs(self, row: Row) -> list[tuple[str, int]]:
+        return [
+            (method, seed)
+            for method in self.table.methods
+            for seed in self.table.seeds
+            if self._may_hold(f"{row}.{method}.{seed}.")
+        ]
+
+    def _may_hold(self, prefix: str) -> bool:
+        """Whether the selected steps may be among those whose names begin with ``prefix``."""
+        only = self.selection.only
+        return only is None or f"{only}.".startswith(f"{self.selection.tag}.{prefix}")
+
+    def _keep_only(self, only: str) -> None:
+        if only not in self.tasks:
+            everything = Plan(
+                self.table, self.selection._replace(only=None), self._configs, self.lookup
+            )
+            close = closest(only, everything.tasks)
+            hint = f"did you mean {close!r}? " if close else ""
+            raise UsageError(
+                f"{self.table.name} has no step {only!r}", f"{hint}`irl plan` lists the names"
+            )
+        kept, pending = set(), [only]
+        while pending:
+            name = pending.pop()
+            kept.add(name)
+            pending += self.needs[name]
+        self.tasks = {name: task for name, task in self.tasks.items() if name in kept}
+
+    def configs(self, env: str) -> Config:
+        """The config of ``env``, without any method's flags."""
+        return self._configs(env, None)
+
+    def step(self, name: str) -> Step:
+        """The state of the step called ``name``; what it waits for is named as in the plan."""
+        step = self.lookup(self.tasks[name].request)
+        if step.status == "BLOCKED":
+            waiting = [n for n in self.needs[name] if not self.exists(n)]
+            shown = ", ".join(waiting[:3])
+            shown += f" and {len(waiting) - 3} more" if len(waiting) > 3 else ""
+            step = step._replace(why=f"waits for {shown}")
+        return step
+
+    def exists(self, name: str) -> bool:
+        """Whether the step's artefact is in the store or in another one."""
+        return self.lookup(self.tasks[name].request).artefact is not None
+
+    def counts(self) -> dict[str, int]:
+        """How many steps have each status."""
+        found = Counter(self.lookup(task.request).status for task in self.tasks.values())
+        return {status: found[status] for status in STATUSES}
+
+    def require_all(self) -> None:
+        """Check that every step exists.
+
+        Raises:
+            NotFound: some do not.
+        """
+        missing = [name for name in self.tasks if not self.exists(name)]
+        if missing:
+            raise NotFound(
+                f"{len(missing)} of {len(self.tasks)} steps of {self.table.name} are missing, "
+                f"for example {missing[0]}",
+                f"`irl run {self.table.name}` makes them",
+            )
+
+
+class _Identities:
+    """Digests that are equal for equal requests."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[Request, str]] = {}
+
+    def __call__(self, request: Request) -> str:
+        if id(request) not in self._known:
+            inputs = {
+                role: [self(source.request), source.output]
+                if isinstance(source, From)
+                else source.sha256
+                for role, source in request.inputs.items()
+            }
+            parameters = msgspec.to_builtins(request.parameters)
+            identity = digest([request.stage.name, request.stage.version, parameters, inputs])
+            self._known[id(request)] = request, identity
+        return self._known[id(request)][1]
+
+
+def _cached(configs: Configs) -> Configs:
+    @cache
+    def load(env: str, flags: tuple[tuple[str, Any], ...]) -> Config:
+        return configs(env, dict(flags))
+
+    def cached(env: str, flags: Mapping[str, Any] | None) -> Config:
+        return load(env, tuple((flags or {}).items()))
+
+    return cached

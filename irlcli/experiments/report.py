@@ -1,0 +1,184 @@
+"""The report of a table, from the artefacts that the store holds of its plan.
+
+Each cell is looked up by its key, so no artefact that was made with other parameters fills it.
+Nothing is computed here.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from irlcli.errors import NotFound
+from irlcli.experiments import facts
+from irlcli.experiments.plan import Plan
+from irlcli.experiments.rows import Task
+from irlcli.experiments.status import source_in
+from irlcli.interventions import parse_settings
+from irlcli.report.parameters import Cell, Row
+from irlcli.stages import report, report_experts
+from irlcli.stages.base import Request, Source
+from irlcli.store import Artefact
+
+_CONFIGS = ("expert", "demonstrations", "airl", "transfer", "evaluation")
+
+
+def request(plan: Plan, command: str) -> Request:
+    """The report of a whole table. ``command`` is the command line that asks for it again.
+
+    Raises:
+        NotFound: the store fills no cell.
+    """
+    if plan.figure is not None:
+        return plan.figure
+    cells, sources = _cells(plan)
+    if not any(cell.run for cell in cells):
+        raise NotFound(
+            f"{plan.lookup.store.root} holds no evaluation of {plan.table.name} with these settings",
+            f"`irl run {plan.table.name}` makes them. --profile, --set, --seeds and --methods must "
+            "be those of the runs; `irl ls` lists what exists",
+        )
+    artefacts = _artefacts(plan)
+    runs, libraries = facts.runs(artefacts.values())
+    if plan.table.kind == "experts":
+        return _experts(plan, command, cells, sources, runs)
+    wanted = [plan.lookup.record(task.request) for task in plan.tasks.values()]
+    others = facts.left_out(
+        plan.lookup.store.artefacts(), [record for record in wanted if record], set(artefacts)
+    )
+    parameters = report.Parameters(
+        kind=plan.table.name,
+        title=plan.table.title,
+        command=command,
+        measures=plan.table.measures,
+        rows=tuple(_rows(plan)),
+        methods=plan.table.methods,
+        seeds=plan.table.seeds,
+        cells=tuple(cells),
+        runs=runs,
+        libraries=libraries,
+        others=tuple(others),
+    )
+    return report.request(parameters, sources)
+
+
+def _experts(
+    plan: Plan,
+    command: str,
+    cells: Sequence[Cell],
+    sources: Mapping[str, Source],
+    runs: Mapping[str, Any],
+) -> Request:
+    if not any(cell.run for cell in cells if cell.agent == "expert"):
+        raise NotFound(
+            f"{plan.lookup.store.root} holds no evaluation of an expert with these settings",
+            f"`irl run {plan.table.name}` makes them. --profile and --set must be those of the runs",
+        )
+    configs = {row.env: plan.configs(row.env).expert for row in plan.table.rows}
+    parameters = report_experts.Parameters(
+        command=command,
+        steps={env: expert.total_steps for env, expert in configs.items()},
+        bars={env: expert.bar for env, expert in configs.items() if expert.bar is not None},
+        cells=tuple(cells),
+        runs=dict(runs),
+    )
+    return report_experts.request(parameters, sources)
+
+
+def _cells(plan: Plan) -> tuple[list[Cell], dict[str, Source]]:
+    """The cells with the ids that fill them, and the stage's inputs by role."""
+    cells, sources = [], {}
+    for task in plan.cells:
+        cell = task.cell
+        assert cell is not None
+        artefact = _held(plan, task.request) or _without_reward(plan, task)
+        if artefact is None:
+            cells.append(msgspec.structs.replace(cell, why=_reason(plan, task.request)))
+        else:
+            cells.append(msgspec.structs.replace(cell, run=artefact.id))
+            sources[cell.role] = source_in(artefact, None)
+        for part, learned in task.curves.items():
+            made = _held(plan, learned)
+            if made is not None:
+                sources[_curve_role(cell, part)] = source_in(made, "metrics.parquet")
+    return cells, sources
+
+
+def _held(plan: Plan, request: Request) -> Artefact | None:
+    """The request's artefact, if it is in the store itself."""
+    step = plan.lookup(request)
+    return step.artefact if step.status == "HIT" else None
+
+
+def _without_reward(plan: Plan, task: Task) -> Artefact | None:
+    """An evaluation of a retrained policy that did not score it by the reward.
+
+    Its true returns are the same.
+    """
+    if task.cell is None or task.cell.measure != "transfer":
+        return None
+    inputs = {"policy": task.request.inputs["policy"]}
+    return _held(plan, task.request._replace(inputs=inputs))
+
+
+def _reason(plan: Plan, request: Request) -> str:
+    """What a missing evaluation waits for."""
+    first = next(step for step in plan.lookup.chain(request) if step.status != "HIT")
+    stage = first.label.split()[0]
+    if first.status == "RESUME":
+        return f"{stage} was interrupted or is running"
+    return f"{stage} has not run"
+
+
+def _curve_role(cell: Cell, part: str) -> str:
+    if cell.agent == "expert":
+        return f"{cell.row.split()[0]} {cell.place} {part}"
+    return f"{cell.row} {cell.agent} {cell.seed} {part}"
+
+
+def _artefacts(plan: Plan) -> dict[str, Artefact]:
+    """Everything the report is made from, by id."""
+    found: dict[str, Artefact] = {}
+    held = [_held(plan, task.request) for task in plan.tasks.values()]
+    held += [_without_reward(plan, task) for task in plan.cells if not _held(plan, task.request)]
+    for artefact in held:
+        if artefact is not None:
+            found[artefact.id] = artefact
+    return found
+
+
+def _rows(plan: Plan) -> list[Row]:
+    rows = []
+    for row in plan.table.rows:
+        config = plan.configs(row.env)
+        listed = config.interventions[row.knob]
+        trained, unseen = (
+            [str(s) for s in parse_settings(row.env, f"{row.knob}={','.join(values)}")]
+            for values in (listed.id, listed.ood)
+        )
+        demos = plan.tasks[f"{plan.selection.tag}.{row}.demos"].request
+        tree = msgspec.to_builtins(config)
+        rows.append(
+            Row(
+                env=row.env,
+                knob=row.knob,
+                trained=tuple(trained),
+                unseen=unseen[0],
+                demonstrations=demos.parameters.episodes,
+                config={stage: tree[stage] for stage in _CONFIGS},
+                chosen=_chosen(plan, str(row)),
+            )
+        )
+    return rows
+
+
+def _chosen(plan: Plan, row: str) -> dict[str, float]:
+    """Each lambda that was chosen by leaving a setting out, by ``METHOD SEED``."""
+    found = {}
+    for method in plan.table.methods:
+        for seed in plan.table.seeds:
+            task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")
+            choice = task and task.request.inputs.get("penalty choice")
+            if choice and _held(plan, choice.request) is not None:
+                found[f"{method} {seed}"] = task.request.parameters.airl.penalty_weight
+    return found

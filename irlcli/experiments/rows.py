@@ -1,0 +1,286 @@
+"""The requests behind each row of a table: named tasks, and the cells of the report they fill.
+
+A task's name is that of its row and what it makes::
+
+    ROW.expert.VALUE  ROW.demos  ROW.METHOD.SEED  ROW.METHOD.SEED.transfer
+    ROW.expert-returns  ROW.random-returns  ROW.idle-returns     in the unseen setting
+    ROW.expert.VALUE.returns                                     in the expert's own setting
+    ROW.expert.VALUE.reused-returns  ....reused-id-returns       in the unseen one, in all trained
+    ROW.METHOD.SEED.zero-shot-returns  ....id-returns  ....transfer-returns  ....expert-by-reward
+    ROW.METHOD.SEED.choice                                       lambda, with --choose-penalty
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import msgspec
+
+from irlcli.configs import Config
+from irlcli.errors import UsageError
+from irlcli.experiments.status import Lookup
+from irlcli.experiments.tables import Row
+from irlcli.interventions import Setting, parse_settings
+from irlcli.methods import fields
+from irlcli.report.parameters import EXPERT_BY_REWARD, Cell
+from irlcli.stages import (
+    choose_penalty,
+    collect_experts,
+    evaluate,
+    figure2,
+    train_airl,
+    train_expert,
+    transfer,
+)
+from irlcli.stages.base import From, Request
+from irlcli.store import file_digest, read_json
+
+Phase = Literal["experts", "demos", "rewards", "transfers", "returns"]
+PHASES: tuple[Phase, ...] = get_args(Phase)
+# The config of an environment, under flags such as ``airl.penalty``.
+Configs = Callable[[str, Mapping[str, Any] | None], Config]
+
+
+class Task(NamedTuple):
+    """A named request.
+
+    Attributes:
+        phase: which of the phases it belongs to.
+        cell: the cell of the report that it fills, if it fills one.
+        curves: stages whose metrics the report draws, by their part of the input's role.
+    """
+
+    name: str
+    phase: Phase
+    request: Request
+    cell: Cell | None = None
+    curves: Mapping[str, Request] = {}
+
+
+class Chosen(NamedTuple):
+    """Candidates for lambda, and the store that knows which of them was chosen."""
+
+    candidates: Sequence[float]
+    lookup: Lookup
+
+    def weight(self, choice: Request) -> float | None:
+        """The lambda that ``choice`` led to; None if it was not made yet."""
+        made = self.lookup(choice).artefact
+        if made is None:
+            return None
+        path = made.directory / "choice.json"
+        if file_digest(path) != made.output("choice.json").sha256:
+            # What needs it reports the damage when it reads the file.
+            return None
+        return msgspec.convert(read_json(path), choose_penalty.Choice).chosen
+
+
+class _RowRequests:
+    """The requests about the experts of one row, each made once."""
+
+    def __init__(self, row: Row, configs: Configs):
+        self.row = row
+        self.config = configs(row.env, None)
+        if row.knob not in self.config.interventions:
+            raise UsageError(
+                f"the settings of {row.env} list no values of {row.knob!r}",
+                f"add [interventions.{row.knob}] to settings/{row.env}.toml",
+            )
+        self.listed = self.config.interventions[row.knob]
+        self.trained, self.unseen = (
+            parse_settings(row.env, f"{row.knob}={','.join(values)}") if values else ()
+            for values in (self.listed.id, self.listed.ood)
+        )
+        self._experts: dict[Setting, Request] = {}
+
+    def cell(self, *args: Any, **kwargs: Any) -> Cell:
+        return Cell(f"{self.row.env} {self.row.knob}", *args, **kwargs)
+
+    def expert(self, place: Setting) -> Request:
+        if place not in self._experts:
+            config = self.config.expert_of(place)
+            self._experts[place] = train_expert.request(self.row.env, place, 0, config)
+        return self._experts[place]
+
+    def returns(
+        self,
+        places: Sequence[Setting],
+        policy: Request | None,
+        agent: Literal["policy", "random", "idle"] = "policy",
+        reward: Request | None = None,
+        labels: Mapping[str, str] | None = None,
+    ) -> Request:
+        return evaluate.request(
+            self.row.env,
+            places,
+            self.config.evaluation,
+            None if policy is None else From(policy, "policy.pt"),
+            agent,
+            reward=None if reward is None else From(reward, "reward.pt"),
+            **(labels or {}),
+        )
+
+    def expert_tasks(self, places: Sequence[Setting]) -> Iterator[Task]:
+        for place in places:
+            yield Task(f"{self.row}.expert.{_value(place)}", "experts", self.expert(place))
+
+    def own_returns(self, place: Setting) -> tuple[str, Request]:
+        """Name and request of an expert's returns in its own setting."""
+        only = self.unseen == (place,)
+        name = "expert-returns" if only else f"expert.{_value(place)}.returns"
+        labels = {"policy_label": f"expert of {place}"}
+        return f"{self.row}.{name}", self.returns([place], self.expert(place), labels=labels)
+
+
+def comparison(
+    row: Row,
+    measures: Sequence[str],
+    runs: Sequence[tuple[str, int]],
+    configs: Configs,
+    chosen: Chosen,
+) -> Iterator[Task]:
+    """The tasks of a row that compares ``runs`` of (method, seed); each after what it needs.
+
+    Raises:
+        UsageError: the settings list no values of the knob, or not one unseen one.
+    """
+    requests = _RowRequests(row, configs)
+    trained, unseen = requests.trained, requests.unseen
+    if not trained or len(unseen) != 1:
+        raise UsageError(
+            f"{row} has {len(trained)} settings to train in and {len(unseen)} held out",
+            "a row needs at least one to train in and exactly one held out",
+        )
+    yield from requests.expert_tasks([*trained, *unseen])
+    demos = collect_experts.request(row.env, trained, requests.config, 0, requests.listed.episodes)
+    yield Task(f"{row}.demos", "demos", demos)
+    place = str(unseen[0])
+    for agent in ("random", "idle"):
+        cell = requests.cell(agent, "ood", place=place)
+        request = requests.returns(unseen, None, agent)
+        yield Task(f"{row}.{agent}-returns", "returns", request, cell)
+    name, request = requests.own_returns(unseen[0])
+    yield Task(name, "returns", request, requests.cell("expert", "ood", place=place))
+    for e in trained:
+        expert, label = requests.expert(e), {"policy_label": f"expert of {e}"}
+        if "id" in measures:
+            name, request = requests.own_returns(e)
+            yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
+        for measure, places in (("ood", unseen), ("id", trained)):
+            if measure == "ood" or "id" in measures:
+                name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
+                request = requests.returns(places, expert, labels=label)
+                cell = requests.cell("reused", measure, place=str(e))
+                yield Task(name, "returns", request, cell)
+    for name, seed in runs:
+        yield from _run(requests, demos, name, seed, measures, configs, chosen)
+
+
+def _run(
+    requests: _RowRequests,
+    demos: Request,
+    method_name: str,
+    seed: int,
+    measures: Sequence[str],
+    configs: Configs,
+    chosen: Chosen,
+) -> Iterator[Task]:
+    """One method with one seed: the reward, and what its policies earn."""
+    env, unseen, trained = requests.row.env, requests.unseen, requests.trained
+    name = f"{requests.row}.{method_name}.{seed}"
+    airl, basis = configs(env, fields(method_name, "airl")).airl, {}
+    if chosen.candidates and airl.penalty != "none":
+        choice = choose_penalty.request(
+            From(demos),
+            env,
+            trained,
+            airl,
+            requests.config.evaluation,
+            chosen.candidates,
+            seed,
+        )
+        yield from _choice(f"{name}.choice", choice)
+        weight = chosen.weight(choice)
+        if weight is not None:
+            airl = msgspec.structs.replace(airl, penalty_weight=weight)
+        basis = {"penalty choice": From(choice, "choice.json")}
+    learned = train_airl.request(From(demos), env, trained, airl, seed, basis)
+    yield Task(name, "rewards", learned)
+    learner = f"{train_airl.describe(learned.parameters.airl)} seed {seed}"
+    student = {"policy_label": f"student {method_name} of seed {seed}"}
+    if "zero-shot" in measures:
+        cell = requests.cell(method_name, "zero-shot", seed)
+        request = requests.returns(unseen, learned, labels=student)
+        curves = {"reward-learning": learned}
+        yield Task(f"{name}.zero-shot-returns", "returns", request, cell, curves)
+    if "id" in measures:
+        cell = requests.cell(method_name, "id", seed)
+        request = requests.returns(trained, learned, labels=student)
+        yield Task(f"{name}.id-returns", "returns", request, cell)
+    if "transfer" in measures:
+        moved = transfer.request(
+            From(learned, "reward.pt"), env, unseen[0], requests.config.transfer, seed, learner
+        )
+        yield Task(f"{name}.transfer", "transfers", moved)
+        labels = {"reward_label": learner, "policy_label": f"transfer {method_name} of seed {seed}"}
+        cell = requests.cell(method_name, "transfer", seed)
+        request = requests.returns(unseen, moved, reward=learned, labels=labels)
+        curves = {"transfer-learning": moved}
+        yield Task(f"{name}.transfer-returns", "returns", request, cell, curves)
+        labels["policy_label"] = f"expert of {unseen[0]}"
+        cell = requests.cell(method_name, EXPERT_BY_REWARD, seed, str(unseen[0]))
+        expert = requests.expert(unseen[0])
+        request = requests.returns(unseen, expert, reward=learned, labels=labels)
+        yield Task(f"{name}.expert-by-reward", "returns", request, cell)
+
+
+def _choice(name: str, choice: Request) -> Iterator[Task]:
+    """The choice of lambda, after the rewards learned for it and what their students earn."""
+    for measured in (source.request for source in choice.inputs.values()):
+        learned = measured.inputs["policy"].request
+        left_out = measured.parameters.settings[0].partition("=")[2].replace(":", "_")
+        trial = f"{name}.{learned.parameters.airl.penalty_weight:g}.without-{left_out}"
+        yield Task(trial, "rewards", learned)
+        yield Task(f"{trial}.returns", "rewards", measured)
+    yield Task(name, "rewards", choice)
+
+
+def experts(row: Row, configs: Configs) -> Iterator[Task]:
+    """The experts of a row's settings, and what they, the random and the idle agent earn there."""
+    requests = _RowRequests(row, configs)
+    for measure, places in (("id", requests.trained), ("ood", requests.unseen)):
+        if not places:
+            continue
+        yield from requests.expert_tasks(places)
+        for agent in ("random", "idle"):
+            name = f"{row}.{agent}{'-id' * (measure == 'id')}-returns"
+            request = requests.returns(places, None, agent)
+            yield Task(name, "returns", request, requests.cell(agent, measure))
+        for place in places:
+            name, request = requests.own_returns(place)
+            cell = requests.cell("expert", measure, place=str(place))
+            yield Task(name, "returns", request, cell, {"learning": requests.expert(place)})
+
+
+def gridworld_figure(configs: Configs) -> tuple[list[Task], Request]:
+    """The datasets and the sweep of Figure 2, and the figure itself."""
+    env = "gridworld"
+    config = configs(env, None)
+    trained = parse_settings(env, f"path-group={','.join(config.interventions['path-group'].id)}")
+    unseen = [
+        setting
+        for knob, listed in config.interventions.items()
+        if listed.ood
+        for setting in parse_settings(env, f"{knob}={','.join(listed.ood)}")
+    ]
+    figure = figure2.request(env, trained, unseen, config)
+    sweep = figure.inputs["sweep"].request
+    tasks = [
+        Task(f"figure2.demos.{source.request.parameters.seed}", "demos", source.request)
+        for source in sweep.inputs.values()
+    ]
+    return [*tasks, Task("figure2.sweep", "rewards", sweep)], figure
+
+
+def _value(setting: Setting) -> str:
+    """A setting's value as a part of a name."""
+    return str(setting.value).replace(":", "_")

@@ -1,0 +1,171 @@
+"""What a store holds of a request: planning without computing, writing or moving anything."""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import msgspec
+
+from irlcli.errors import IntegrityError, UsageError
+from irlcli.stages.base import From, Request, Source
+from irlcli.store import (
+    Artefact,
+    KeyRecord,
+    Resolved,
+    Store,
+    content_digest,
+    digest,
+    directory_outputs,
+    file_digest,
+)
+
+Status = Literal["HIT", "FOUND", "RUN", "RESUME", "BLOCKED"]
+STATUSES: tuple[Status, ...] = ("HIT", "FOUND", "RUN", "RESUME", "BLOCKED")
+
+
+class Step(NamedTuple):
+    """The state of one request.
+
+    Attributes:
+        status: ``HIT`` in the store, ``FOUND`` in another one, ``RUN`` or ``RESUME`` if it can be
+            computed now, ``BLOCKED`` if an input is missing.
+        label: the request's label.
+        why: the reason for the status.
+        artefact: of a HIT or FOUND; the latter lies in the other store.
+        key: unknown while an input is missing.
+    """
+
+    status: Status
+    label: str
+    why: str
+    artefact: Artefact | None = None
+    key: str | None = None
+
+
+class Lookup:
+    """The states of requests. Each request is looked up once.
+
+    Args:
+        store: where artefacts are looked up first. It may be read-only or not exist yet.
+        sources: read-only stores that are looked into on a miss.
+    """
+
+    def __init__(self, store: Store, sources: Sequence[Store] = ()):
+        self.store = store
+        self._sources = sources
+        # By identity. The request is kept, so that no other object can get its id.
+        self._steps: dict[int, tuple[Request, Step]] = {}
+
+    def __call__(self, request: Request) -> Step:
+        """The state of ``request``.
+
+        Raises:
+            NewerFormat: a newer version wrote its artefact.
+        """
+        if id(request) not in self._steps:
+            self._steps[id(request)] = request, self._look_up(request)
+        return self._steps[id(request)][1]
+
+    def chain(self, request: Request) -> list[Step]:
+        """The states of ``request`` and all its ancestors, inputs first, equal requests once."""
+        steps: dict[str, Step] = {}
+        self._walk(request, steps)
+        return list(steps.values())
+
+    def forget_missing(self) -> None:
+        """Look again for everything that was not in the store."""
+        self._steps = {i: kept for i, kept in self._steps.items() if kept[1].status == "HIT"}
+
+    def _walk(self, request: Request, steps: dict[str, Step]) -> str:
+        inputs = {
+            role: source.sha256 if isinstance(source, Source) else self._walk(source.request, steps)
+            for role, source in request.inputs.items()
+        }
+        # Labels leave things out that distinguish requests, so they cannot identify them.
+        name = digest([*_identity(request), inputs])
+        steps.setdefault(name, self(request))
+        return name
+
+    def record(self, request: Request) -> KeyRecord | None:
+        """The key record of ``request``; None while an input is missing."""
+        inputs: dict[str, str] = {}
+        for role, source in request.inputs.items():
+            if isinstance(source, Source):
+                inputs[role] = source.sha256
+                continue
+            artefact = self(source.request).artefact
+            if artefact is None:
+                return None
+            inputs[role] = source_in(artefact, source.output).sha256
+        return key_record(request, inputs)
+
+    def _look_up(self, request: Request) -> Step:
+        label = request.label
+        record = self.record(request)
+        if record is None:
+            sources = [s.request for s in request.inputs.values() if isinstance(s, From)]
+            missing = [s.label for s in sources if self(s).artefact is None]
+            return Step("BLOCKED", label, f"waits for {', '.join(missing)}")
+        key = record.key
+        there = self.store.peek(key)
+        if there.artefact is not None:
+            return Step("HIT", label, str(there.artefact.directory), there.artefact, key)
+        if there.problem is not None:
+            return Step("RUN", label, f"{there.problem}: it would be computed again", key=key)
+        if self._sources:
+            # A hit in a store without sources does not load it.
+            from irlcli.store.substitute import find_in
+
+            found = find_in(self._sources, key)
+            if found is not None:
+                return Step("FOUND", label, f"in {found.store.root}", found.artefact, key)
+        if self.store.has_checkpoint(key):
+            why = "a checkpoint exists: the run was interrupted, or another process is working"
+            return Step("RESUME", label, why, key=key)
+        return Step("RUN", label, f"no artefact has the key {key[:12]}", key=key)
+
+
+def key_record(request: Request, inputs: Mapping[str, str]) -> KeyRecord:
+    """The key record of ``request``, given the sha256 of each input."""
+    return KeyRecord(*_identity(request), dict(inputs))
+
+
+def _identity(request: Request) -> tuple[str, int, dict]:
+    return request.stage.name, request.stage.version, msgspec.to_builtins(request.parameters)
+
+
+def source_in(artefact: Artefact, output: str | None) -> Source:
+    """An output of ``artefact`` as a stage's input; without ``output``, all of it.
+
+    Raises:
+        NotFound: the artefact has no such output.
+    """
+    if output is None:
+        return Source(artefact.directory, artefact.manifest.content, artefact)
+    return Source(artefact.directory / output, artefact.output(output).sha256, artefact)
+
+
+def source_of(resolved: Resolved) -> Source:
+    """A resolved reference as a stage's input.
+
+    Raises:
+        UsageError: a foreign directory without files, or one that cannot be read.
+        IntegrityError: a foreign directory that holds links, pipes or names that no output can
+            have.
+    """
+    if resolved.artefact is not None:
+        return source_in(resolved.artefact, resolved.output)
+    try:
+        if resolved.path.is_file():
+            return Source(resolved.path, file_digest(resolved.path))
+        outputs = directory_outputs(resolved.path)
+        if not outputs:
+            raise UsageError(f"{resolved.path} holds no files", "name a file or an artefact")
+        return Source(resolved.path, content_digest(outputs))
+    except OSError as error:
+        raise UsageError(
+            f"{resolved.path} cannot be read ({error.strerror})", "name a file or an artefact"
+        ) from None
+    except ValueError as error:
+        raise IntegrityError(
+            f"{resolved.path}: {error}", "name a directory of plain files, or an artefact"
+        ) from None

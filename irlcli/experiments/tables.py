@@ -1,0 +1,240 @@
+"""The tables and figures of ``settings/experiments.toml``: rows, methods, seeds and measures."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import msgspec
+
+from irlcli.configs.load import load_config, read_toml, settings_directory
+from irlcli.envs.registry import ENVIRONMENTS
+from irlcli.errors import UsageError, closest, suggest
+from irlcli.interventions import knob_of
+from irlcli.methods import METHODS
+
+Kind = Literal["comparison", "experts", "figure2"]
+Measure = Literal["transfer", "zero-shot", "id"]
+MEASURES: tuple[Measure, ...] = get_args(Measure)
+_NAME = r"[a-z][a-z0-9-]{0,30}"
+_DEFAULTS = "defaults"
+
+
+class Row(msgspec.Struct, frozen=True):
+    """One row of a table: an environment and the knob that is intervened on."""
+
+    env: str
+    knob: str
+
+    def __str__(self) -> str:
+        return f"{self.env}.{self.knob}"
+
+
+class Table(msgspec.Struct, frozen=True, kw_only=True):
+    """One table or figure.
+
+    Attributes:
+        name: as in ``irl run NAME``.
+        kind: a ``comparison`` of methods has rows, methods, seeds and measures. A file lists none
+            of them for the other kinds: ``experts`` has a row for every intervention in
+            ``settings/``, ``figure2`` is about the gridworld.
+        settings: a TOML file laid over the profile.
+    """
+
+    name: str
+    title: str
+    kind: Kind = "comparison"
+    rows: tuple[Row, ...] = ()
+    methods: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+    measures: tuple[Measure, ...] = ()
+    settings: Path | None = None
+
+
+def default_file() -> Path:
+    """``settings/experiments.toml``."""
+    return settings_directory() / "experiments.toml"
+
+
+def load_tables(path: Path | None = None) -> dict[str, Table]:
+    """All tables of the file ``path``, by name. None is the default file.
+
+    Raises:
+        UsageError: not TOML; an unknown field, kind, environment, knob, method or measure; a
+            missing field. The message names the file and the field.
+    """
+    path = path or default_file()
+    try:
+        tree = read_toml(path)
+    except UsageError as error:
+        raise UsageError(error.message, f"see {default_file()} for an example") from None
+    defaults = tree.pop(_DEFAULTS, {})
+    try:
+        _check_fields(defaults, _DEFAULTS, ("methods", "seeds"))
+        return {name: _table(name, value, defaults, path.parent) for name, value in tree.items()}
+    except UsageError as error:
+        raise UsageError(f"{path}: {error.message}", error.hint) from None
+
+
+def load_table(name: str, path: Path | None = None) -> Table:
+    """The table called ``name``.
+
+    Raises:
+        UsageError: no table has that name; or as :func:`load_tables`.
+    """
+    tables = load_tables(path)
+    if name not in tables:
+        raise UsageError(f"unknown table {name!r}", suggest(name, tables))
+    table = tables[name]
+    if table.kind == "experts":
+        return msgspec.structs.replace(table, rows=_every_row())
+    return table
+
+
+def narrowed(
+    table: Table,
+    methods: Sequence[str] | None = None,
+    seeds: Sequence[int] | None = None,
+    env: str | None = None,
+) -> Table:
+    """``table`` with other methods and seeds, and only the rows of one environment.
+
+    Raises:
+        UsageError: an unknown or repeated method or seed, an empty list, no row of ``env``, or
+            a table of a kind without them.
+    """
+    given = {"--methods": methods, "--seeds": seeds}
+    if table.kind != "comparison":
+        given |= {"--env": env} if table.kind == "figure2" else {}
+        for option, value in given.items():
+            if value is not None:
+                raise UsageError(f"{table.name} takes no {option}", f"omit {option}")
+    changes: dict[str, Any] = {}
+    if methods is not None:
+        _check_list("--methods", methods, METHODS)
+        changes["methods"] = tuple(methods)
+    if seeds is not None:
+        _check_list("--seeds", seeds)
+        changes["seeds"] = tuple(seeds)
+    if env is not None:
+        changes["rows"] = tuple(row for row in table.rows if row.env == env)
+        if not changes["rows"]:
+            names = sorted({row.env for row in table.rows})
+            raise UsageError(
+                f"{table.name} has no row of {env!r}", f"its environments: {', '.join(names)}"
+            )
+    return msgspec.structs.replace(table, **changes)
+
+
+def _every_row() -> tuple[Row, ...]:
+    """Every intervention that the files in ``settings/`` list, of environments with policies."""
+    return tuple(
+        Row(env.name, knob)
+        for env in ENVIRONMENTS.values()
+        if not env.tabular
+        for knob in load_config(env.name).interventions
+    )
+
+
+def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) -> Table:
+    if not re.fullmatch(_NAME, name):
+        raise UsageError(
+            f"{name!r} cannot be the name of a table",
+            "a lowercase letter, then up to 30 lowercase letters, digits and '-'",
+        )
+    fields = [f for f in Table.__struct_fields__ if f != "name"]
+    _check_fields(value, name, fields)
+    kind = _one_of(f"{name}.kind", value.get("kind", "comparison"), get_args(Kind))
+    title = _text(f"{name}.title", value.get("title", name))
+    settings = None
+    if "settings" in value:
+        settings = directory / _text(f"{name}.settings", value["settings"])
+        if not settings.is_file():
+            raise UsageError(
+                f"{name}.settings: {settings} is not a file", f"a path relative to {directory}"
+            )
+    comparing = ("rows", "methods", "seeds", "measures")
+    if kind != "comparison":
+        for field in comparing:
+            if field in value:
+                raise UsageError(f"{name}.{field}: kind {kind!r} has no {field}", f"omit {field}")
+        return Table(name=name, title=title, kind=kind, settings=settings)
+    filled = {**defaults, **value}
+    for field in comparing:
+        if field not in filled:
+            raise UsageError(f"{name}.{field} is missing", f"fields: {', '.join(fields)}")
+        _check_is_list(f"{name}.{field}", filled[field])
+    rows = [_row(f"{name}.rows", text) for text in filled["rows"]]
+    _check_list(f"{name}.rows", rows)
+    _check_list(f"{name}.methods", filled["methods"], METHODS)
+    _check_list(f"{name}.measures", filled["measures"], MEASURES)
+    for seed in filled["seeds"]:
+        if type(seed) is not int or seed < 0:
+            raise UsageError(f"{name}.seeds: {seed!r} is not a seed", "a whole number from 0")
+    _check_list(f"{name}.seeds", filled["seeds"])
+    return Table(
+        name=name,
+        title=title,
+        kind=kind,
+        rows=tuple(rows),
+        methods=tuple(filled["methods"]),
+        seeds=tuple(filled["seeds"]),
+        measures=tuple(filled["measures"]),
+        settings=settings,
+    )
+
+
+def _row(field: str, text: Any) -> Row:
+    env, _, knob = _text(field, text).partition(".")
+    known = [
+        f"{e.name}.{k}" for e in ENVIRONMENTS.values() if not e.tabular for k in sorted(e.knobs)
+    ]
+    if env not in ENVIRONMENTS or ENVIRONMENTS[env].tabular:
+        close = closest(text, known)
+        hint = f"did you mean {close!r}? " if close else ""
+        fit = [e.name for e in ENVIRONMENTS.values() if not e.tabular]
+        raise UsageError(
+            f"{field}: {text!r} names no environment that rows can be of",
+            f"{hint}write ENVIRONMENT.INTERVENTION, with one of: {', '.join(fit)}",
+        )
+    try:
+        knob_of(env, knob)
+    except UsageError as error:
+        raise UsageError(f"{field}: {error.message}", error.hint) from None
+    return Row(env, knob)
+
+
+def _check_fields(value: Any, name: str, fields: Sequence[str]) -> None:
+    if not isinstance(value, Mapping):
+        raise UsageError(f"{name} is not a table", f"write [{name}] with: {', '.join(fields)}")
+    for field in value:
+        if field not in fields:
+            raise UsageError(f"{name} has no field {field!r}", suggest(field, fields))
+
+
+def _check_is_list(field: str, value: Any) -> None:
+    if not isinstance(value, list):
+        raise UsageError(f"{field}: {value!r} is not a list", "write [..., ...]")
+
+
+def _check_list(field: str, values: Sequence[Any], known: Mapping | Sequence | None = None) -> None:
+    """Refuse an empty list, unknown values and repetitions."""
+    if not values:
+        raise UsageError(f"{field}: the list is empty", "name at least one")
+    for i, value in enumerate(values):
+        if known is not None:
+            _one_of(field, value, list(known))
+        if value in values[:i]:
+            raise UsageError(f"{field}: {value} appears twice", "name each once")
+
+
+def _one_of(field: str, value: Any, known: Sequence[str]) -> Any:
+    if value not in known:
+        raise UsageError(f"{field}: unknown {value!r}", suggest(str(value), known))
+    return value
+
+
+def _text(field: str, value: Any) -> str:
+    if not isinstance(value, str) or not value.isprintable():
+        raise UsageError(f"{field}: {value!r} is not text", "write it in quotes")
+    return value
