@@ -47,12 +47,10 @@ def write_gif(
         _panels(world, policy, f"{env} {setting}", limit, stride, seed)
         for world, setting in zip(worlds, settings, strict=True)
     ]
-    frames: list[Image.Image] = []
-    last: list[Image.Image | None] = [None] * len(worlds)
-    while True:
-        drawn = [next(panel, None) for panel in panels]
-        if not any(drawn):
-            break
+    # Every episode has a panel, so the first row of panels is complete.
+    last = [next(panel) for panel in panels]
+    frames = [_beside(last)]
+    while any(drawn := [next(panel, None) for panel in panels]):
         last = [new or old for new, old in zip(drawn, last, strict=True)]
         frames.append(_beside(last))
     for world in worlds:
@@ -70,13 +68,17 @@ def _panels(
     total = 0.0
     for step in range(limit):
         if step % stride == 0:
-            yield _panel(world.render(), f"{caption}   step {step}   return {total:.0f}")
+            yield _panel(_frame(world), f"{caption}   step {step}   return {total:.0f}")
         action = policy.act(np.asarray(observation)[None], deterministic=True)[0]
         observation, reward, terminated, truncated, _ = world.step(action)
-        total += reward
+        total += float(reward)
         if terminated or truncated:
             break
-    yield _panel(world.render(), f"{caption}   step {step + 1}   return {total:.0f}")
+    yield _panel(_frame(world), f"{caption}   step {step + 1}   return {total:.0f}")
+
+
+def _frame(world: gymnasium.Env) -> np.ndarray:
+    return np.asarray(world.render())
 
 
 def _panel(picture: np.ndarray, caption: str) -> Image.Image:

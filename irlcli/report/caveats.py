@@ -73,10 +73,11 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
         if r.short:
             higher, lower = r.short_scored_higher, r.short - r.short_scored_higher
             parts = [
-                f"The reward scores {higher} of them above the expert: it prefers a worse policy."
+                f"The reward scores {higher} of them above the expert, so it prefers a worse policy."
             ] * (higher > 0)
             parts += [
-                f"It does not score {lower} of them above the expert, so optimisation fell short."
+                f"The reward scores the expert at least as high as {lower} of them, so optimisation "
+                "fell short."
             ] * (lower > 0)
             found.append(
                 f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.seeds} retrained "

@@ -37,10 +37,13 @@ _INK = "#010203"
 
 @contextmanager
 def _style(ink: str) -> Iterator[None]:
-    colours = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
     with plt.rc_context(
         {
-            **dict.fromkeys(colours, ink),
+            "text.color": ink,
+            "axes.edgecolor": ink,
+            "axes.labelcolor": ink,
+            "xtick.color": ink,
+            "ytick.color": ink,
             "font.size": 9,
             "axes.titlesize": 9,
             "axes.spines.top": False,
@@ -79,7 +82,7 @@ def draw_points(directory: Path, p: Parameters, report: Report) -> str:
 
 
 def _points(p: Parameters, report: Report) -> plt.Figure:
-    measures = [m for m in p.measures if m != "id"]
+    measures = [m for m in p.measures if m != "id"] or ["id"]
     size = (0.6 + 3.2 * len(p.rows), 0.5 + 2.7 * len(measures))
     figure, axes = plt.subplots(
         len(measures), len(p.rows), figsize=size, squeeze=False, layout="constrained"
@@ -98,7 +101,7 @@ def _panel(axis: plt.Axes, p: Parameters, report: Report, row: Row, measure: str
     cells = report.cells[report.cells["row"] == row.name].set_index(["agent", "measure"])
     for agent in BASELINES:
         # Drawn even without a value, because all panels share the first one's legend.
-        value = cells.loc[(agent, "ood"), "mean"]
+        value = cells["mean"].get((agent, "id" if measure == "id" else "ood"))
         axis.axhline(
             np.nan if pd.isna(value) else value,
             color=ink,
@@ -144,7 +147,7 @@ def learning_curves(p: Parameters, learning: Mapping[str, pd.DataFrame]) -> dict
 
     ``learning`` maps ``ROW METHOD SEED reward-learning`` (or ``transfer-learning``) to metrics.
     """
-    found = {}
+    found: dict[str, str] = {}
     with _style(_INK):
         for row in p.rows:
             for kind, what in (

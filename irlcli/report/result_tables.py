@@ -17,8 +17,8 @@ from irlcli.report.tables import Table
 from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
-    "Mean true return ± standard deviation over seeds. p: Welch's test, AIRL-IRM against AIRL-ERM; "
-    "Holm: adjusted over the rows that have a p-value. (3/5): three of five seeds exist; (part): "
+    "Mean true return ± standard deviation over seeds. p: Welch's test, "
+    f"{title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a p-value. (3/5): three of five seeds exist; (part): "
     "some evaluations are missing. † not imitated in distribution. ‡ runs of more than one commit "
     "or set of libraries. Training experts, reused: the experts of the training settings, each "
     "evaluated where the students are, their mean: the return without learning a reward. Progress: "
@@ -76,7 +76,7 @@ def measures(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
 def _measure(
     p: Parameters, measure: str, note: str, cells: pd.DataFrame, comparisons: pd.DataFrame
 ) -> Table:
-    """A line per row, one more for its progress, and one for the paper's numbers."""
+    """A line per row for its return, and more for progress and for the paper's numbers."""
     baseline = "id" if measure == "id" else "ood"
     agents = [*p.methods, "expert", "reused"]
     agents += [] if measure == "id" else ["random", "idle"]
@@ -163,7 +163,8 @@ def comparisons(found: pd.DataFrame) -> Table:
     lines = []
     for r in found[found["difference"].notna()].itertuples():
         printed = paper.TABLE1.get(tuple(r.row.split(" ", 1)))
-        shown = r.measure == "transfer" and (r.x, r.y) == ("irm", "erm") and printed is not None
+        if r.measure != "transfer" or (r.x, r.y) != ("irm", "erm"):
+            printed = None
         remark = "not imitated: do not interpret the gap" if r.not_imitated else ""
         lines.append(
             [
@@ -175,7 +176,7 @@ def comparisons(found: pd.DataFrame) -> Table:
                 p_value(r.p_welch_holm),
                 f"{p_value(r.p_paired)} ({r.pairs})",
                 p_value(r.p_student),
-                p_value(_paper_p(printed, equal_variances=True)) if shown else "",
+                "" if printed is None else p_value(_paper_p(printed, equal_variances=True)),
                 number(r.improvement, 2),
                 r.why or remark,
             ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,7 +78,7 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
                 which = " under the reward of seed ".join(map(str, seeds))
                 raise UsageError(f"{agent} in {item.setting} has seed {which} twice", _HINT)
             first = parameters_of.setdefault(key, parameters)
-            for name in sorted(first | parameters):
+            for name in sorted({*first, *parameters}):
                 if first.get(name) != parameters.get(name):
                     raise UsageError(
                         f"runs of {agent} in {item.setting} differ in {name}: "
@@ -89,11 +89,25 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
             groups.setdefault(key, {})[tuple(seeds)] = values
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):
-        returns, episodes, *others = zip(*items.values(), strict=True)
-        means = (None if None in values else statistics.fmean(values) for values in others)
-        policies = len({seed for seed, *_ in items})
-        found.append(Row(agent, env, setting, returns, min(episodes), *means, policies))
+        returns, episodes, progress, learned = zip(*items.values(), strict=True)
+        found.append(
+            Row(
+                agent,
+                env,
+                setting,
+                returns,
+                min(episodes),
+                _mean(progress),
+                _mean(learned),
+                policies=len({seed for seed, *_ in items}),
+            )
+        )
     return found
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if len(known) == len(values) else None
 
 
 def agent_name(policy: Subject, setting: str) -> str:

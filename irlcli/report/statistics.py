@@ -137,7 +137,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return adjusted
 
 
-def identical_runs(episodes: Mapping[Run, Sequence[float]]) -> list[tuple[Run, ...]]:
+def identical_runs(episodes: Mapping[Run, Sequence[float] | np.ndarray]) -> list[tuple[Run, ...]]:
     """Groups of runs whose returns are bitwise equal in every episode.
 
     Such runs are one run, whatever their seeds or methods.

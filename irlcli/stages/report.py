@@ -5,6 +5,7 @@ how long, at which commit) are parameters, so that equal requests give equal byt
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 from irlcli.report.parameters import (
     EXPERT_BY_REWARD,
@@ -40,7 +41,8 @@ def run(job: Job) -> None:
     from irlcli.store import read_json
 
     p: Parameters = job.parameters
-    points, episodes = [], {}
+    points: list[dict[str, Any]] = []
+    episodes: dict[tuple[str, str], dict[tuple[str, int], Any]] = {}
     for cell in p.cells:
         if not cell.run:
             continue

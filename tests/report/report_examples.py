@@ -67,12 +67,17 @@ def example(values, **more):
                         "evaluation": id16,
                     }
                 )
-    given = {"rows": ROWS, "methods": ("erm", "irm"), "seeds": (0, 1, 2), "others": ()} | more
+    given = {
+        "rows": ROWS,
+        "measures": ("transfer", "zero-shot", "id"),
+        "methods": ("erm", "irm"),
+        "seeds": (0, 1, 2),
+        "others": (),
+    } | more
     p = Parameters(
         kind="table1",
         title="Table 1",
         command="irl report table1",
-        measures=("transfer", "zero-shot", "id"),
         cells=tuple(cells),
         runs=runs,
         libraries={"lib": {"numpy": "2"}},

@@ -56,10 +56,10 @@ def test_a_wrong_reward_and_a_failed_optimisation_are_told_apart():
     erm, irm = (c for c in scored(pairs).caveats if c.startswith("Short of the expert"))
     assert erm.startswith(f"Short of the expert: {BOUNCE}, AIRL-ERM: 3 of 3 retrained policies. ")
     assert "scores 2 of them above the expert" in erm
-    assert "does not score 1 of them above the expert, so optimisation fell short" in erm
+    assert "scores the expert at least as high as 1 of them, so optimisation fell short" in erm
     assert irm.startswith(f"Short of the expert: {BOUNCE}, AIRL-IRM: 3 of 3 retrained policies. ")
     assert "prefers a worse policy" not in irm
-    assert "does not score 3 of them above the expert" in irm
+    assert "scores the expert at least as high as 3 of them" in irm
 
 
 def test_missing_evaluations_and_tests():

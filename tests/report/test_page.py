@@ -111,6 +111,12 @@ def test_every_seed_is_plotted(tmp_path, method):
     assert again == svg
 
 
+def test_the_student_in_distribution_is_plotted_if_nothing_else_is_measured(tmp_path):
+    p, points = example(complete(), measures=("id",))
+    svg = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
+    assert "true return, id" in svg
+
+
 def test_learning_curves_have_a_plot_per_row_and_kind():
     p, _ = example(complete())
     recorded = metrics(0.9, 0.1, 1.0)
