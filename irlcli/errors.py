@@ -1,7 +1,7 @@
-"""Errors that a user can act on: each carries an exit code and a hint.
+"""Errors that a user can act on. Each has an exit code and a hint.
 
-Every module raises these for input it cannot use; only the command line turns them into
-text and an exit status. Anything else that escapes is a defect of the program.
+Any module raises them for input that it cannot use. Only the command line turns them into text and
+an exit status. Every other exception that reaches the command line is a bug.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from collections.abc import Iterable
 
 
 class IrlError(Exception):
-    """An error with a one-line message, a hint and the exit code it maps to.
+    """An error with a one-line message, a hint and an exit code.
 
-    ``details`` are for programs: ``--json`` shows them beside the message.
+    ``details`` are for programs: ``--json`` prints them next to the message.
     """
 
     exit_code = 1
@@ -31,51 +31,51 @@ class StageFailed(IrlError):
 
 
 class UsageError(IrlError):
-    """The request itself is wrong: an unknown name, value, setting or flag (exit 2)."""
+    """The request is wrong: an unknown name, value, setting or flag (exit 2)."""
 
     exit_code = 2
 
 
 class NotFound(IrlError):
-    """A reference names no artefact or file, or more than one (exit 3)."""
+    """A reference matches no artefact or file, or more than one (exit 3)."""
 
     exit_code = 3
 
 
 class IntegrityError(IrlError):
-    """Stored bytes are not what they were when published, or are not ours to read (exit 4)."""
+    """Stored bytes differ from what was published, or have an unsupported format (exit 4)."""
 
     exit_code = 4
 
-    def __init__(self, message: str, hint: str = "make it again, or name another"):
+    def __init__(self, message: str, hint: str = "recompute it, or choose another one"):
         super().__init__(message, hint)
 
 
 class NewerFormat(IntegrityError):
-    """Sound bytes in a form that only a newer version of this program knows (exit 4)."""
+    """Intact bytes in a format that only a newer version of this program reads (exit 4)."""
 
     def __init__(self, what: str, found: object, known: int):
         super().__init__(
-            f"{what} has schema {found}, newer than the {known} known here",
-            "it was written by a newer irlcli: upgrade this one",
+            f"{what} has schema {found}, newer than {known}, the newest that this version reads",
+            "a newer irlcli wrote it: upgrade irlcli to read it",
         )
 
 
 class Busy(IrlError):
-    """Another process holds what this one needs; trying again later will work (exit 75)."""
+    """Another process holds a lock that this one needs; retry later (exit 75)."""
 
     exit_code = 75
 
 
 class Interrupted(IrlError):
-    """Stopped by a signal after a checkpoint was written (exit 130)."""
+    """A signal stopped the run after a checkpoint was written (exit 130)."""
 
     exit_code = 130
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that a mistyped ``name`` most likely means, if one is near."""
-    # Imported here: only mistakes need it, and every command imports this module.
+    """The known name that is most similar to ``name``, or ``None`` if none is similar."""
+    # Imported here because only mistakes need it, and every command imports this module.
     import difflib
 
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
@@ -83,7 +83,7 @@ def closest(name: str, known: Iterable[str]) -> str | None:
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """A hint for a mistyped ``name``: the closest known one, and all of them."""
+    """A hint for a mistyped ``name``: the most similar known name, and all known names."""
     known = sorted(known)
     close = closest(name, known)
     listed = f"known: {', '.join(known)}"

@@ -1,4 +1,4 @@
-"""Seeds derived from a purpose, so that no two uses of one seed share their random numbers."""
+"""Seeds derived from a purpose, so that two uses of one seed never share random numbers."""
 
 import zlib
 
@@ -6,6 +6,13 @@ import numpy as np
 
 
 def derive(purpose: str, seed: int, index: int, count: int = 1) -> list[int]:
-    """``count`` seeds below 2**31 for use ``index`` (at least -1) of ``purpose`` under ``seed``."""
+    """Derive ``count`` seeds, each below 2**31.
+
+    Args:
+        purpose: what the random numbers are for, such as ``"replay"``.
+        seed: the run's seed, at least 0.
+        index: number of the use within the purpose, such as a round; at least -1.
+        count: number of seeds.
+    """
     entropy = [zlib.crc32(purpose.encode()), seed, index + 1]
     return [int(x) for x in np.random.SeedSequence(entropy).generate_state(count) % 2**31]

@@ -1,7 +1,7 @@
-"""Environments by setting, and their registration with gymnasium.
+"""Registration of the environments with gymnasium, and their construction from a setting.
 
-Importing this module registers the environments, so that
-``gymnasium.make("irlcli/LunarLander-v0", bounce=0.5)`` works. Gymnasium 1 has no plugin entry points.
+Gymnasium 1 has no plugin entry points. Import this module to register the environments; then
+``gymnasium.make("irlcli/LunarLander-v0", bounce=0.5)`` works.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def register() -> None:
 
 
 def make(env: str, setting: Setting, render_mode: str | None = None) -> gymnasium.Env:
-    """The bare environment of one setting, without gymnasium's wrappers or time limit.
+    """Make the environment of one setting, without gymnasium's wrappers and time limit.
 
     Raises:
-        UsageError: unknown environment, or an intervention it does not have.
+        UsageError: the environment is unknown, or does not have one of the interventions.
     """
     # Environments that were added since this module was imported.
     register()

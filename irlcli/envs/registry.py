@@ -1,4 +1,4 @@
-"""Every environment, one line each. Importing this loads no environment."""
+"""All environments by name. Importing this module does not import any environment."""
 
 from irlcli.envs.ant.spec import SPEC as ANT
 from irlcli.envs.gridworld.spec import SPEC as GRIDWORLD
@@ -17,7 +17,7 @@ def environment(name: str) -> EnvironmentSpec:
     """The environment called ``name``.
 
     Raises:
-        UsageError: there is no such environment.
+        UsageError: no environment has this name.
     """
     if name not in ENVIRONMENTS:
         raise UsageError(f"unknown environment {name!r}", suggest(name, ENVIRONMENTS))

@@ -1,4 +1,4 @@
-"""What the program knows of an environment without importing it."""
+"""The description of an environment, available without importing the environment itself."""
 
 from typing import Literal, NamedTuple
 
@@ -6,15 +6,15 @@ Form = Literal["multiplier", "absolute", "triple", "range"]
 
 
 class Knob(NamedTuple):
-    """One mechanism of an environment that can be intervened on.
+    """One mechanism of an environment that an intervention can change.
 
     Attributes:
-        argument: the environment's keyword argument.
-        forms: the forms that a value may have, the usual one first.
-        low, high: inclusive bounds of every number of a value.
-        description: one phrase for messages.
-        whole: only whole numbers are allowed.
-        observed: the value becomes part of the observation.
+        argument: keyword argument of the environment that takes the value.
+        forms: allowed forms of a value; the usual form comes first.
+        low, high: inclusive bounds of every number in a value.
+        description: short noun phrase for messages.
+        whole: whether only whole numbers are allowed.
+        observed: whether the value becomes part of the observation.
     """
 
     argument: str
@@ -27,17 +27,19 @@ class Knob(NamedTuple):
 
 
 class EnvironmentSpec(NamedTuple):
-    """One environment: what it is called, what can be changed in it, how long an episode lasts.
+    """One environment: its names, its interventions and its time limit.
 
     Attributes:
-        name: as in ``--env``.
+        name: name on the command line, as in ``--env ant``.
         entry_point: ``module:class`` of the gymnasium environment.
-        gym_id: id under which gymnasium knows it.
+        gym_id: id in gymnasium's registry.
         max_episode_steps: time limit [steps].
-        knobs: by name.
-        discrete_actions: whether an action is an index; a vector otherwise.
-        tabular: solved exactly; value iteration gives the experts, ``train-maxent`` the rewards.
-        physics: counts the changes that altered what happens in it. Part of every key.
+        knobs: the mechanisms that can be intervened on, by name.
+        discrete_actions: whether an action is an index (otherwise a vector).
+        tabular: whether the environment is solved exactly: experts come from value iteration
+            and rewards from ``train-maxent``.
+        physics: version of the dynamics and the true reward. It is part of every key: increase
+            it with each change that alters trajectories.
     """
 
     name: str

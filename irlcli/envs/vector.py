@@ -1,7 +1,7 @@
 """Several environments stepped together in this process, with automatic resets.
 
-Gymnasium's own vector environments deep-copy infos and merge dictionaries every step, which
-costs as much as a LunarLander step; this one moves arrays only.
+Gymnasium's own vector environments copy infos deeply and merge dictionaries in every step, which
+costs as much as a step of LunarLander. The class here handles arrays only.
 """
 
 from __future__ import annotations
@@ -17,8 +17,14 @@ import numpy as np
 class Ended:
     """An episode that ended in this step.
 
-    ``progress`` is the sum of ``info["progress"]``, NaN if the environment reports none;
-    ``error`` is ``info["error"]`` of the last step, what ended an episode that cannot go on.
+    Attributes:
+        world: index of the environment.
+        final_observation: last observation [D] float32.
+        terminated: whether the episode terminated; otherwise it was truncated.
+        episode_return: sum of the true rewards.
+        length: number of steps.
+        progress: sum of ``info["progress"]``, or NaN if the environment does not report it.
+        error: ``info["error"]`` of the last step: why a simulation could not continue.
     """
 
     world: int
@@ -31,11 +37,14 @@ class Ended:
 
 
 class VectorWorlds:
-    """N environments, one action array in, one observation array out.
+    """N environments that take one array of actions and return one array of observations.
 
     Args:
-        envs: environments of equal observation and action spaces.
+        envs: environments with equal observation and action spaces.
         max_episode_steps: time limit after which an episode is truncated.
+
+    Raises:
+        ValueError: ``envs`` is empty.
     """
 
     def __init__(self, envs: Sequence[gymnasium.Env], max_episode_steps: int):
@@ -45,6 +54,7 @@ class VectorWorlds:
         self.max_episode_steps = max_episode_steps
         self.observation_space = envs[0].observation_space
         self.action_space = envs[0].action_space
+        self._shape = (len(self.envs), *(self.observation_space.shape or ()))
         self._discrete = isinstance(self.action_space, gymnasium.spaces.Discrete)
         self._lengths = np.zeros(len(self.envs), dtype=np.int64)
         self._returns = np.zeros(len(self.envs), dtype=np.float64)
@@ -54,7 +64,7 @@ class VectorWorlds:
         return len(self.envs)
 
     def reset(self, seeds: Sequence[int]) -> np.ndarray:
-        """Start a fresh episode in every environment; observations [N, D] float32."""
+        """Start an episode in every environment, and return observations [N, D] float32."""
         self._lengths[:] = 0
         self._returns[:] = 0.0
         self._progress[:] = np.nan
@@ -65,10 +75,10 @@ class VectorWorlds:
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Ended]]:
         """Advance every environment by one action of ``actions`` [N] or [N, A].
 
-        Returns observations [N, D] (already those of the next episode where one ended), true
-        rewards [N] float64, and the episodes that ended.
+        Returns observations [N, D] float32, true rewards [N] float64, and the episodes that
+        ended. Where an episode ended, the observation is the first one of the next episode.
         """
-        observations = np.empty((len(self.envs), *self.observation_space.shape), dtype=np.float32)
+        observations = np.empty(self._shape, dtype=np.float32)
         rewards = np.empty(len(self.envs), dtype=np.float64)
         ended: list[Ended] = []
         choices = actions.tolist() if self._discrete else actions

@@ -1,13 +1,14 @@
 """Environments stepped together by worker processes, with automatic resets.
 
-Every worker steps its own share of the worlds as :class:`irlcli.envs.vector.VectorWorlds`
-does; observations, actions and rewards cross in shared memory, only the episodes that ended
-cross in messages. A world never sees another, so results do not depend on the number of
-workers. The worlds are dealt out like cards: those of one setting, which cost the same, stand
-side by side.
+Each worker steps its share of the environments as :class:`irlcli.envs.vector.VectorWorlds` does.
+Observations, actions and rewards pass through shared memory; only ended episodes are sent as
+messages. The environments are independent, so results do not depend on the number of workers.
 
-A message is one byte, which is all that most steps need ("step"; "done, no episode ended"), or
-the byte that says so and a pickle.
+Worker k of n gets environments k, k + n, k + 2n, and so on. Environments of one setting are
+neighbours and cost the same, so this balances the load.
+
+A message is one byte, optionally followed by a pickle. Most steps need the byte only: the request
+to step, and the answer that no episode ended.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.errors import StageFailed
 
 _CLOSE_SECONDS = 5.0
-# What a pipe raises whose other end is gone.
+# Raised by a pipe whose other end is closed.
 _CLOSED = (EOFError, BrokenPipeError, ConnectionResetError)
 _PLAIN, _PICKLED = b"0", b"1"
 
@@ -37,11 +38,11 @@ class WorkerFailed(StageFailed):
     """A worker process died, or an environment in it raised an error (exit 1)."""
 
     def __init__(self, message: str):
-        super().__init__(message, "run the same command again to go on")
+        super().__init__(message, "run the same command again to resume")
 
 
 class _Channel(NamedTuple):
-    """One end of a pair of pipes. ``None`` is the message that costs nothing."""
+    """One end of a pair of pipes. The message ``None`` is sent without a pickle."""
 
     incoming: Connection
     outgoing: Connection
@@ -64,7 +65,7 @@ class _Channel(NamedTuple):
 
 @dataclass(frozen=True)
 class _Shared:
-    """The arrays that all processes see; worlds first."""
+    """The arrays in shared memory; their first axis is the environment."""
 
     actions: Any
     observations: Any
@@ -91,12 +92,12 @@ def _work(
     workers: int,
     shared: _Shared,
 ) -> None:
-    """A worker's life: serve requests until told to stop or until the parent is gone.
+    """Serve requests until the parent closes its end of the pipe.
 
-    The parent's end of the pipe closes with the parent however it ends, so waiting for a
-    request is also watching for the parent's death.
+    The operating system closes that end when the parent ends for any reason, so no worker
+    outlives its parent.
     """
-    # Ctrl-C reaches the whole foreground group; what it means is the parent's decision.
+    # Ctrl-C reaches the whole foreground process group; the parent decides how to react.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     worlds: VectorWorlds | None = None
     actions, observations, rewards = (view[worker::workers] for view in shared.views())
@@ -121,16 +122,16 @@ def _work(
 
 
 class WorkerWorlds:
-    """N environments shared out among worker processes; steps like ``VectorWorlds``.
+    """N environments distributed over worker processes, with the interface of ``VectorWorlds``.
 
     Args:
-        factories: one picklable function per world that makes its environment; all of equal
-            observation and action spaces.
+        factories: one picklable function per environment that makes it. All environments have
+            equal observation and action spaces.
         max_episode_steps: time limit after which an episode is truncated.
-        workers: number of processes, at most one per world.
+        workers: number of processes, at most one per environment.
 
     Raises:
-        ValueError: no factory, or a number of workers outside [1, N].
+        ValueError: ``factories`` is empty, or ``workers`` is not in [1, N].
     """
 
     def __init__(
@@ -149,8 +150,8 @@ class WorkerWorlds:
         sample.close()
         self.max_episode_steps = max_episode_steps
         self._size = len(factories)
-        action_shape = (self._size, *self.action_space.shape)
-        observation_shape = (self._size, *self.observation_space.shape)
+        action_shape = (self._size, *(self.action_space.shape or ()))
+        observation_shape = (self._size, *(self.observation_space.shape or ()))
         shared = _Shared(
             RawArray("d", int(np.prod(action_shape))),
             RawArray("f", int(np.prod(observation_shape))),
@@ -160,7 +161,8 @@ class WorkerWorlds:
             isinstance(self.action_space, gymnasium.spaces.Discrete),
         )
         self._actions, self._observations, self._rewards = shared.views()
-        # A spawned process inherits no pipe end of its siblings, which would hide a death.
+        # A forked process would inherit its siblings' pipe ends and keep them open, which would
+        # hide the death of a worker or of the parent.
         context = multiprocessing.get_context("spawn")
         self._channels: list[_Channel] = []
         self._processes: list[multiprocessing.process.BaseProcess] = []
@@ -182,11 +184,11 @@ class WorkerWorlds:
         return self._size
 
     def reset(self, seeds: Sequence[int]) -> np.ndarray:
-        """Start a fresh episode in every environment; observations [N, D] float32.
+        """Start an episode in every environment, and return observations [N, D] float32.
 
         Raises:
-            ValueError: another number of seeds than of environments.
-            WorkerFailed: a worker died, or an environment raised an error; all are closed.
+            ValueError: the number of seeds differs from the number of environments.
+            WorkerFailed: a worker died, or an environment raised an error. All workers are ended.
         """
         if len(seeds) != self._size:
             raise ValueError(f"{self._size} seeds are needed, not {len(seeds)}")
@@ -198,12 +200,12 @@ class WorkerWorlds:
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Ended]]:
         """Advance every environment by one action of ``actions`` [N] or [N, A].
 
-        Returns observations [N, D] (already those of the next episode where one ended), true
-        rewards [N] float64, and the episodes that ended.
+        Returns observations [N, D] float32, true rewards [N] float64, and the episodes that
+        ended. Where an episode ended, the observation is the first one of the next episode.
 
         Raises:
-            ValueError: actions of another shape, or not finite.
-            WorkerFailed: a worker died, or an environment raised an error; all are closed.
+            ValueError: the actions have a wrong shape or are not finite.
+            WorkerFailed: a worker died, or an environment raised an error. All workers are ended.
         """
         actions = np.asarray(actions)
         if actions.shape != self._actions.shape:
@@ -215,7 +217,7 @@ class WorkerWorlds:
         return self._observations.copy(), self._rewards.copy(), ended
 
     def close(self) -> None:
-        """End every worker; closing twice does nothing."""
+        """End every worker; a second call does nothing."""
         for channel in self._channels:
             channel.close()
         for process in self._processes:
@@ -227,7 +229,7 @@ class WorkerWorlds:
         self._processes = []
 
     def _ask(self, requests: Sequence[list[int] | None]) -> list[Ended]:
-        """Send one request to each worker and gather the episodes that ended, by world."""
+        """Send one request to each worker, and return the ended episodes in order of world."""
         if not self._channels:
             raise WorkerFailed("the workers are closed")
         ended: list[Ended] = []
@@ -241,7 +243,7 @@ class WorkerWorlds:
                     raise WorkerFailed(f"{self._name(worker)}: {answer}")
                 ended += answer or []
         except BaseException as error:
-            # An answer left unread would be taken for that of the next request.
+            # An unread answer would be mistaken for the answer to the next request.
             failure = self._died(worker) if isinstance(error, _CLOSED) else error
             self.close()
             raise failure from None

@@ -1,4 +1,4 @@
-"""What the tests of the PyBullet robots share."""
+"""Helpers shared by the tests of the PyBullet robots."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def trace(name: str) -> dict[str, np.ndarray]:
 
 
 def replay(env, recorded: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Observations [T+1, D] and rewards [T] of a trace's actions from its start."""
+    """Observations [T+1, D] and rewards [T] of a trace's actions, from the trace's start."""
     start = recorded["initial_joint_positions"]
     observations = [env.reset(seed=0, options={"joint_positions": start})[0]]
     rewards = []
@@ -33,12 +33,12 @@ def replay(env, recorded: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 
 def body(env) -> tuple[int, int]:
-    """Bullet's body and client id of an environment's robot."""
+    """Bullet's body id and client id of an environment's robot."""
     return env._robot.body, env._robot.client
 
 
 def total_mass(env) -> float:
-    """Mass of all links, by Bullet's own account."""
+    """Total mass of all links, as reported by Bullet."""
     robot, client = body(env)
     links = range(-1, pybullet.getNumJoints(robot, physicsClientId=client))
     return sum(pybullet.getDynamicsInfo(robot, i, physicsClientId=client)[0] for i in links)

@@ -1,4 +1,4 @@
-"""Lets the tests beside this file import their shared module by name."""
+"""Puts this directory on the import path, so that the tests here can import their helpers."""
 
 import sys
 from pathlib import Path

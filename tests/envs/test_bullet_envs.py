@@ -1,4 +1,4 @@
-"""The PyBullet robots as gymnasium environments: interface, seeds, bad input, rendering."""
+"""The PyBullet robots as gymnasium environments: interface, seeds, invalid input, rendering."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def env(request):
 
 
 @pytest.mark.parametrize(("name", "model"), EVERY)
-def test_passes_gymnasiums_check(name, model):
+def test_passes_gymnasiums_checker(name, model):
     env = ROBOTS[name](model=model)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -39,7 +39,7 @@ def test_passes_gymnasiums_check(name, model):
 
 
 @pytest.mark.parametrize("name", ["Ant", "HalfCheetah", "Reacher"])
-def test_passes_gymnasiums_check_of_rendering_without_a_display(name, monkeypatch):
+def test_passes_gymnasiums_rendering_check_without_a_display(name, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     env = gymnasium.make(f"irlcli/{name}-v0", render_mode="rgb_array").unwrapped
     with warnings.catch_warnings():
@@ -58,7 +58,7 @@ def test_has_the_documented_sizes(name):
     env.close()
 
 
-def test_full_observation_adds_the_originals_zeros():
+def test_full_observation_appends_the_originals_zeros():
     env = Ant(full_observation=True)
     observation, _ = env.reset(seed=0)
     assert observation.shape == (111,)
@@ -74,7 +74,7 @@ def roll(env, seed: int, steps: int = 60) -> np.ndarray:
     return np.array(path)
 
 
-def test_an_episode_is_a_function_of_its_seed_whatever_came_before(env):
+def test_an_episode_depends_on_its_seed_only(env):
     expected = roll(env, 7)
     roll(env, 8)
     np.testing.assert_array_equal(roll(env, 7), expected)
@@ -84,7 +84,7 @@ def test_an_episode_is_a_function_of_its_seed_whatever_came_before(env):
     assert not np.array_equal(roll(env, 8), expected)
 
 
-def test_worlds_of_one_process_do_not_touch(env):
+def test_two_environments_in_one_process_do_not_affect_each_other(env):
     expected = roll(env, 3)
     other = type(env)()
     other.reset(seed=4)
@@ -116,7 +116,7 @@ def test_the_reward_is_the_sum_of_its_terms(env):
         assert not truncated
 
 
-def test_an_idle_ant_is_paid_for_being_alive():
+def test_an_idle_ant_is_rewarded_for_being_alive_only():
     env = Ant()
     env.reset(seed=0)
     infos = [env.step(np.zeros(8))[4] for _ in range(300)]
@@ -125,7 +125,7 @@ def test_an_idle_ant_is_paid_for_being_alive():
     assert abs(sum(info["progress"] for info in infos)) * 0.0165 < 1.0
 
 
-def test_joint_positions_set_the_start(env):
+def test_the_reset_option_joint_positions_sets_the_start(env):
     size = {Ant: 8}.get(type(env), 9 if env.action_space.shape == (6,) else 4)
     positions = np.linspace(0.01, 0.05, size)
     observation, _ = env.reset(seed=0, options={"joint_positions": positions})
@@ -145,14 +145,14 @@ def test_joint_positions_set_the_start(env):
         ({"positions": [0.0] * 8}, "the only reset option is 'joint_positions'"),
     ],
 )
-def test_bad_reset_options_are_refused(options, message):
+def test_invalid_reset_options_are_rejected(options, message):
     env = Ant()
     with pytest.raises(ValueError, match=message):
         env.reset(options=options)
     env.close()
 
 
-def test_bad_actions_are_refused(env):
+def test_invalid_actions_are_rejected(env):
     env.reset(seed=0)
     size = env.action_space.shape[0]
     with pytest.raises(ValueError, match="finite"):
@@ -169,7 +169,7 @@ def explode(env) -> None:
         pybullet.resetJointState(robot, joint, math.nan, math.nan, physicsClientId=client)
 
 
-def test_a_world_that_explodes_ends_its_episode_and_the_next_one_is_sound(env):
+def test_a_simulation_that_explodes_truncates_the_episode_and_leaves_the_next_one_unaffected(env):
     expected = roll(env, 5)
     env.reset(seed=0)
     before = env.step(np.zeros(env.action_space.shape))[0]
@@ -184,27 +184,27 @@ def test_a_world_that_explodes_ends_its_episode_and_the_next_one_is_sound(env):
 QUIET = """
 import os, sys
 sys.path.insert(0, {fake!r})
-import irlcli.envs.registration.bullet
+import irlcli.envs.bullet.engine
 print(sys.modules["pybullet"].__file__)
 """
 
 
-def test_what_pybullet_says_when_imported_is_passed_on_but_for_its_banner(tmp_path):
+def test_importing_pybullet_hides_its_banner_and_forwards_other_output(tmp_path):
     (tmp_path / "pybullet.py").write_text(
         "import os\nos.write(2, b'pybullet build time: today\\nreal trouble\\n')\n"
     )
-    said = [
+    imports = [
         subprocess.run(
             [sys.executable, "-c", QUIET.format(fake=fake)], capture_output=True, text=True
         )
         for fake in (str(tmp_path), "")
     ]
-    assert said[0].stdout == f"{tmp_path / 'pybullet.py'}\n"
-    assert said[0].stderr == "real trouble\n"
-    assert (said[1].returncode, said[1].stderr) == (0, "")
+    assert imports[0].stdout == f"{tmp_path / 'pybullet.py'}\n"
+    assert imports[0].stderr == "real trouble\n"
+    assert (imports[1].returncode, imports[1].stderr) == (0, "")
 
 
-def test_training_goes_on_after_an_explosion():
+def test_stepping_several_environments_continues_after_one_explodes():
     worlds = VectorWorlds([Ant(), Ant()], max_episode_steps=50)
     worlds.reset([0, 1])
     explode(worlds.envs[1])
@@ -232,7 +232,7 @@ def test_renders_without_a_display(name, monkeypatch):
     plain.close()
 
 
-def test_a_window_without_a_display_is_refused(env, monkeypatch):
+def test_a_window_without_a_display_is_rejected(env, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(RuntimeError, match="needs a display"):
         type(env)(render_mode="human")
@@ -247,7 +247,7 @@ def test_closing_twice_is_harmless(env):
     env.close()
 
 
-def test_resets_do_not_grow_the_process():
+def test_resets_do_not_leak_memory():
     env = Ant()
 
     def resident() -> int:

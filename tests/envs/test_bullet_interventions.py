@@ -1,4 +1,4 @@
-"""Each intervention does to the physics what its name says, and refuses absurd values."""
+"""Each intervention changes the physics as documented and rejects values out of range."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_mass_multiplies_every_link(robot, model):
     np.testing.assert_allclose(inertias[1], 4.0 * np.array(inertias[0]))
 
 
-def test_ant_weighs_what_its_volume_says():
+def test_ants_mass_follows_from_its_volume():
     env = started(Ant())
     torso = 1000.0 * 4.0 / 3.0 * math.pi * 0.25**3
     capsule = [
@@ -47,7 +47,7 @@ def test_ant_weighs_what_its_volume_says():
 
 
 def sliding_distance(friction: float) -> float:
-    """How far an Ant lying on its belly slides from 3 m/s with its joints held still."""
+    """Distance that an Ant on its belly slides from 3 m/s with its joints held still."""
     env = started(Ant(friction=(friction, 0.0, 0.0)))
     robot, client = body(env)
     lifted = [0.0, 0.5236, 0.0, -0.5236, 0.0, -0.5236, 0.0, 0.5236]
@@ -68,7 +68,7 @@ def sliding_distance(friction: float) -> float:
 
 
 def test_friction_shortens_a_slide():
-    """A block at v slides v^2 / (2 mu g); Bullet multiplies mu by the floor's 0.8."""
+    """A block of speed v slides v^2 / (2 mu g); Bullet multiplies mu by the floor's 0.8."""
     slippery, rough = sliding_distance(0.25), sliding_distance(0.5)
     expected = 3.0**2 / (2.0 * 0.8 * 0.5 * GRAVITY)
     assert rough == pytest.approx(expected, rel=0.3)
@@ -76,7 +76,7 @@ def test_friction_shortens_a_slide():
 
 
 @pytest.mark.parametrize("robot", [Ant, HalfCheetah])
-def test_friction_reaches_every_link(robot):
+def test_friction_applies_to_every_link(robot):
     env = started(robot(friction=(2.5, 0.7, 0.6)))
     number, client = body(env)
     for link in range(-1, pybullet.getNumJoints(number, physicsClientId=client)):
@@ -96,7 +96,7 @@ def test_leg_length_stretches_the_ants_hind_legs_only():
     (front, hind), (front_3x, hind_3x) = reach
     assert front_3x == pytest.approx(front)
     assert front == pytest.approx(hind, abs=1e-6)
-    # Both segments, 0.2 and 0.4 along y, grow by two of themselves.
+    # Both segments, 0.2 and 0.4 along y, become three times as long.
     assert hind_3x - hind == pytest.approx(2.0 * (0.2 + 0.4), abs=0.02)
 
 
@@ -129,7 +129,7 @@ def test_leg_length_stretches_both_legs_of_the_half_cheetah(scale):
 
 
 def holding_torques(env, shoulder: float, elbow: float) -> np.ndarray:
-    """Torques [2] that hold the merged arm: the moments of its links' weights about each joint."""
+    """Torques [2] that hold the merged arm: moments of its links' weights about each joint."""
     arm, client = body(env)
     links = [pybullet.getDynamicsInfo(arm, link, physicsClientId=client) for link in range(2)]
     masses, middles = [link[0] for link in links], [link[3][0] for link in links]
@@ -142,7 +142,7 @@ def holding_torques(env, shoulder: float, elbow: float) -> np.ndarray:
 
 @pytest.mark.parametrize("gravity", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize(("shoulder", "elbow"), [(0.0, 0.0), (0.7, -1.2), (2.5, 2.0)])
-def test_gravity_sets_the_torque_that_holds_the_reacher(gravity, shoulder, elbow):
+def test_gravity_determines_the_torque_that_holds_the_reacher(gravity, shoulder, elbow):
     env = started(Reacher(gravity=gravity), options={"joint_positions": [shoulder, elbow, 0, 0]})
     torques = holding_torques(env, shoulder, elbow)
     for _ in range(10):
@@ -156,7 +156,7 @@ def test_gravity_sets_the_torque_that_holds_the_reacher(gravity, shoulder, elbow
     assert np.abs(fallen[[6, 8]]).max() > 0.05 * gravity
 
 
-def test_the_reachers_motors_hold_every_pose_of_every_setting():
+def test_the_reachers_motors_can_hold_every_pose_at_the_largest_gravity():
     env = started(Reacher(gravity=4.0))
     arm, client = body(env)
     most = [
@@ -173,27 +173,27 @@ def test_the_reachers_motors_hold_every_pose_of_every_setting():
 
 
 def reaches(**arguments) -> np.ndarray:
-    """Observations [51, 9] of a Reacher under the same weak torques."""
+    """Observations [51, 9] of a Reacher under constant weak torques."""
     env = started(Reacher(**arguments))
     path = [env.reset(seed=0)[0], *(env.step(np.array([0.1, -0.05]))[0] for _ in range(50))]
     env.close()
     return np.array(path)
 
 
-def test_gravity_acts_along_the_joints_axes_of_a_level_table():
+def test_gravity_has_no_effect_on_a_level_table():
     none, heavy = reaches(gravity=0.0), reaches(gravity=4.0, tilt=0.0)
     np.testing.assert_array_equal(none, heavy)
     np.testing.assert_array_equal(none, reaches(gravity=0.0, tilt=30.0))
 
 
-def test_every_gravity_of_the_settings_moves_the_reacher_otherwise():
+def test_each_gravity_setting_moves_the_reacher_differently():
     half, double, fourfold = (reaches(gravity=gravity) for gravity in (0.5, 2.0, 4.0))
     assert np.abs(half - double).max() > 0.1
     assert np.abs(double - fourfold).max() > 0.1
 
 
 def glide(env, heading: float) -> float:
-    """Progress of one step of an Ant in the air that moves at 1 m/s in a direction (degrees)."""
+    """Progress in one step of an airborne Ant that moves at 1 m/s along a heading (degrees)."""
     robot, client = body(env)
     pybullet.resetBasePositionAndOrientation(
         robot, (0, 0, 20), (0, 0, 0, 1), physicsClientId=client
@@ -219,13 +219,13 @@ def test_progress_rewards_a_straight_walk_to_the_goal(arguments, heading):
         env = started(Ant(**arguments), options={"joint_positions": [0, 1, 0, -1, 0, -1, 0, 1]})
         progress[offset] = glide(env, heading + offset)
         env.close()
-    # The floor counts as one of the 22 parts whose mean is taken.
+    # The floor, which does not move, is one of the 22 parts in the mean position.
     assert progress[0.0] == pytest.approx(21 / 22, abs=0.01)
     assert progress[60.0] == pytest.approx(0.5 * 21 / 22, abs=0.01)
     assert progress[90.0] == pytest.approx(0.0, abs=0.01)
 
 
-def test_half_cheetahs_progress_is_its_velocity_along_the_goal():
+def test_half_cheetahs_progress_is_its_velocity_toward_the_goal():
     straight = started(HalfCheetah())
     aside = started(HalfCheetah(direction=60.0))
     action = np.full(6, 0.5)
@@ -253,7 +253,7 @@ def test_a_range_of_directions_is_drawn_per_episode_and_observed(robot):
 
 
 @pytest.mark.parametrize("robot", [Ant, HalfCheetah])
-def test_the_goal_is_observed_only_where_it_varies(robot):
+def test_the_goal_is_observed_only_if_it_is_intervened_on(robot):
     plain, zero = robot(), robot(goal_y=0.0)
     assert zero.observation_space.shape[0] == plain.observation_space.shape[0] + 2
     np.testing.assert_allclose(zero.reset(seed=0)[0][-2:], [1.0, 0.0])
@@ -285,11 +285,11 @@ def test_the_goal_is_observed_only_where_it_varies(robot):
         ("reacher", {"tilt": 91.0}, r"tilt must lie in \[0, 90\], not 91.0"),
     ],
 )
-def test_absurd_values_are_refused(robot, arguments, message):
+def test_values_out_of_range_are_rejected(robot, arguments, message):
     with pytest.raises(ValueError, match=message):
         ROBOTS[robot](**arguments)
 
 
-def test_unknown_interventions_are_refused():
+def test_unknown_interventions_are_rejected():
     with pytest.raises(TypeError):
         Reacher(mass=2.0)

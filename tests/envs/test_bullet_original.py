@@ -1,4 +1,4 @@
-"""The original models reproduce recorded traces; the merged ones move as the originals do."""
+"""Original models reproduce the recorded traces; merged models move like the originals."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from bullet_robots import ROBOTS, body, replay, total_mass, trace
 
 from irlcli.envs.bullet.world import TIME_STEP
 
-# Bullet's MJCF importer leaves memory uninitialised that decides in which order contacts are
-# solved. This recording was made with other memory contents than zeros: its order differs from
-# step 23 on, and contact amplifies that. Filling the memory with any other byte, or making the
-# links' boxes anew in some 7,000 orders, gave at most 295 of its 400 steps.
+# Bullet's MJCF importer leaves memory uninitialised that determines the order in which contacts
+# are solved. This trace was recorded with non-zero memory contents: its order differs from step 23
+# on, and contacts amplify the difference. Other byte values, and some 7,000 other insertion orders
+# of the links' bounding boxes, reproduced at most 295 of its 400 steps.
 SAME_ORDER = {"half_cheetah_0": 23}
 
 
@@ -27,7 +27,7 @@ def test_original_reproduces_the_recorded_trace(name):
     if name.startswith("reacher"):
         arguments = {"gravity": 0.0}
     env = robot(model="original", **arguments)
-    # The few recycled blocks of memory that cannot be zeroed may disturb the order, rarely.
+    # A few recycled memory blocks cannot be zeroed, which in rare cases changes the order.
     for _ in range(3):
         observations, rewards = replay(env, recorded)
         last = SAME_ORDER.get(name, len(rewards) + 1)
@@ -36,15 +36,15 @@ def test_original_reproduces_the_recorded_trace(name):
             break
     env.close()
     np.testing.assert_allclose(observations[:last], expected[:last], 1e-6, 1e-6)
-    # The original counts the floor among the Ant's parts only after its first reset returned,
-    # which shifts the first step's progress and nothing else.
+    # The original counts the floor among the Ant's parts only after its first reset, which
+    # changes the progress of the first step only.
     first = 1 if name.startswith("ant") else 0
     np.testing.assert_allclose(
         rewards[first : last - 1], recorded["rewards"][first : last - 1], 1e-6, 1e-6
     )
 
 
-def test_the_odd_trace_is_a_matter_of_the_order_of_contacts():
+def test_the_deviating_trace_differs_in_the_order_of_contacts_only():
     recorded = trace("half_cheetah_0")
     env = ROBOTS["half_cheetah"](model="original")
     start = recorded["initial_joint_positions"]
@@ -53,7 +53,8 @@ def test_the_odd_trace_is_a_matter_of_the_order_of_contacts():
         path = [env.reset(seed=0, options={"joint_positions": start})[0]]
         robot, client = body(env)
         for link in (13, 11, 9, 3, 7, 5):
-            # Setting a filter, even to what it was, enters the link's box into the tree anew.
+            # Setting a collision filter, even to its old value, inserts the link's bounding box
+            # into the broad phase's tree again.
             pybullet.setCollisionFilterGroupMask(robot, link, 1, 1, physicsClientId=client)
         path += [env.step(action)[0] for action in recorded["actions"]]
         equal = np.isclose(path, recorded["observations"], rtol=1e-6, atol=1e-6).all(axis=1)
@@ -97,7 +98,7 @@ STARTS = {
 
 
 def fly(name: str, model: str, steps: int, damping: float | None) -> tuple[np.ndarray, ...]:
-    """Observations and rewards of a robot out of the ground's reach."""
+    """Observations and rewards of a robot that never touches the ground."""
     env = ROBOTS[name](model=model)
     env.reset(seed=0, options={"joint_positions": STARTS[name]})
     robot, client = body(env)
@@ -117,36 +118,44 @@ def fly(name: str, model: str, steps: int, damping: float | None) -> tuple[np.nd
 
 
 @pytest.mark.parametrize(("name", "steps"), [("ant", 60), ("half_cheetah", 15), ("reacher", 60)])
-def test_merged_flies_exactly_as_the_original(name, steps):
-    """To rounding, for as long as no limit is struck, with Bullet's damping switched off."""
+def test_merged_flies_exactly_like_the_original(name, steps):
+    """Up to rounding, until a joint reaches its limit, and without Bullet's damping."""
     original, merged = (fly(name, model, steps, 0.0) for model in ("original", "merged"))
     np.testing.assert_allclose(merged[0], original[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(merged[1], original[1], rtol=1e-6, atol=1e-6)
 
 
-def test_damping_is_all_that_differs_in_flight():
-    """Bullet damps each link by its own speed squared, so a merged one is damped otherwise."""
+def test_only_damping_differs_in_flight():
+    """Bullet damps each link by its own squared speed, which differs for a merged link."""
     original, merged = (fly("ant", model, 5, None) for model in ("original", "merged"))
     difference = np.abs(original[0] - merged[0])
     assert 1e-6 < difference.max() < 0.02
     assert difference[:, :13].max() < 5e-4
 
 
-@pytest.mark.parametrize(("name", "tolerance"), [("ant", 0.02), ("half_cheetah", 0.02)])
-def test_merged_lands_as_the_original(name, tolerance):
-    """Dropped without torques: positions and angles agree through the first contacts."""
-    paths = []
-    for model in ("original", "merged"):
-        env = ROBOTS[name](model=model)
-        joints = 8 if name == "ant" else 9
-        env.reset(seed=0, options={"joint_positions": [0.0] * joints})
-        paths.append([env.step(np.zeros(env.action_space.shape))[0] for _ in range(25)])
-        robot, client = body(env)
-        assert pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
-        env.close()
-    positions = 13 if name == "ant" else 8
-    difference = np.abs(np.array(paths[0]) - np.array(paths[1]))[:, :positions]
-    assert difference.max() < tolerance
+def drop(name: str, model: str) -> np.ndarray:
+    """Heights, angles and positions [25, P] of a robot that falls without torques."""
+    env = ROBOTS[name](model=model)
+    joints, size = (8, 13) if name == "ant" else (9, 8)
+    env.reset(seed=0, options={"joint_positions": [0.0] * joints})
+    path = [env.step(np.zeros(env.action_space.shape))[0][:size] for _ in range(25)]
+    robot, client = body(env)
+    assert pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
+    env.close()
+    return np.array(path)
+
+
+@pytest.mark.parametrize("name", ["ant", "half_cheetah"])
+def test_merged_lands_like_the_original(name):
+    """Dropped without torques, positions and angles agree through the first contacts."""
+    merged = drop(name, "merged")
+    # As above, recycled memory changes the original's order of contacts in rare cases.
+    differences = []
+    for _ in range(3):
+        differences.append(np.abs(drop(name, "original") - merged).max())
+        if differences[-1] < 0.02:
+            break
+    assert min(differences) < 0.02
 
 
 @pytest.mark.parametrize("name", ["ant", "half_cheetah"])

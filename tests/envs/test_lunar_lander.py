@@ -1,4 +1,4 @@
-"""The intervened LunarLander: the original where nothing is changed, physics where it is."""
+"""LunarLander equals the original without interventions, and each intervention takes effect."""
 
 import gymnasium
 import numpy as np
@@ -40,7 +40,7 @@ def test_renders_an_image():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_without_intervention_it_is_the_original_to_the_bit(seed):
+def test_without_intervention_it_is_bit_identical_to_the_original(seed):
     actions = np.random.default_rng(seed).integers(4, size=400)
     ours = run(LunarLander(), seed, actions)
     theirs = run(gymnasium.make("LunarLander-v3").unwrapped, seed, actions)
@@ -57,20 +57,20 @@ def velocity_after(action, **kwargs):
 
 @pytest.mark.parametrize("power", [0.5, 1.25, 3.0])
 def test_engine_power_multiplies_the_main_engines_impulse(power):
-    # The dispersion is drawn whatever the action, so the same seed gives the same direction.
+    # The dispersion is drawn for every action, so the same seed gives the same direction.
     nothing = velocity_after(0)
     once = velocity_after(2) - nothing
     scaled = velocity_after(2, engine_power=power) - nothing
     np.testing.assert_allclose(scaled, power * once, rtol=1e-4, atol=1e-6)
 
 
-def test_engine_power_leaves_side_engines_and_the_module_alone():
+def test_engine_power_changes_neither_side_engines_nor_the_module():
     np.testing.assert_array_equal(velocity_after(1), velocity_after(1, engine_power=3.0))
     assert original.MAIN_ENGINE_POWER == 13.0
 
 
 def place_on_pad(env, height, velocity):
-    """Put the lander ``height`` above where it would stand, moving with ``velocity``."""
+    """Place the lander ``height`` above its standing position, moving with ``velocity``."""
     env.reset(seed=0)
     bodies = [env.lander, *env.legs]
     drop = env.lander.position[1] - (env.helipad_y + 18 / 30 + height)
@@ -81,7 +81,7 @@ def place_on_pad(env, height, velocity):
 
 
 def rebound_speed(bounce):
-    """Greatest upward speed [m/s] after a straight fall at 4 m/s."""
+    """Largest upward speed [m/s] after a vertical fall at 4 m/s."""
     env = LunarLander(bounce=bounce)
     place_on_pad(env, 1.0, (0.0, -4.0))
     speeds = []
@@ -99,7 +99,7 @@ def test_bounce_is_restitution():
 
 
 def sliding_distance(friction):
-    """How far the lander slides [m] in 0.8 s from 3 m/s along the pad."""
+    """Distance [m] that the lander slides along the pad in 0.8 s from 3 m/s."""
     env = LunarLander(friction=friction)
     place_on_pad(env, 0.02, (3.0, 0.0))
     start = env.lander.position[0]
@@ -111,11 +111,11 @@ def sliding_distance(friction):
 def test_friction_shortens_the_slide():
     distances = [sliding_distance(friction) for friction in (0.001, 0.2, 4.0)]
     assert distances[0] > distances[1] > distances[2]
-    # Almost nothing slows it down: 0.8 s at 3 m/s.
+    # Almost without friction: 0.8 s at 3 m/s.
     assert distances[0] == pytest.approx(2.4, rel=0.1)
 
 
-def test_instances_do_not_touch_each_other():
+def test_instances_do_not_affect_each_other():
     actions = np.random.default_rng(0).integers(4, size=200)
     kwargs = [{}, {"engine_power": 2.0, "bounce": 0.9}, {"friction": 3.0}]
     alone = [run(LunarLander(**k), 5, actions) for k in kwargs]
@@ -130,7 +130,7 @@ def test_instances_do_not_touch_each_other():
                 assert reward == rewards[t]
 
 
-def test_fixed_horizon_absorbs_where_the_episode_ended():
+def test_fixed_horizon_turns_termination_into_an_absorbing_state():
     actions = [0] * 300
     free, rewards = run(LunarLander(), 1, actions)
     env = LunarLander(fixed_horizon=250)
@@ -157,11 +157,11 @@ def test_fixed_horizon_absorbs_where_the_episode_ended():
         {"fixed_horizon": 0},
     ],
 )
-def test_absurd_values_are_refused_by_name(kwargs):
+def test_values_out_of_range_are_rejected_by_name(kwargs):
     with pytest.raises(ValueError, match=next(iter(kwargs))):
         LunarLander(**kwargs)
 
 
-def test_make_passes_the_setting_on():
+def test_make_applies_the_setting():
     env = envs.make("lunar-lander", parse_setting("lunar-lander", "engine-power=1.25x"))
     assert (env.engine_power, env.bounce, env.friction) == (1.25, 0.0, 0.1)

@@ -1,4 +1,4 @@
-"""Stepping several worlds together is stepping each alone."""
+"""Environments stepped together behave like environments stepped alone."""
 
 import gymnasium
 import numpy as np
@@ -6,13 +6,14 @@ import pytest
 
 from irlcli.envs.vector import VectorWorlds
 from irlcli.interventions import parse_settings
-from irlcli.rl import ppo as rl
+from irlcli.rl.worlds import make_worlds
+from irlcli.trajectories import world_settings
 
 SETTINGS = parse_settings("lunar-lander", "engine-power=1x,1.5x")
 
 
 def test_equals_single_environments_with_resets_and_time_limit():
-    worlds = rl.make_worlds("lunar-lander", SETTINGS, 4)
+    worlds = make_worlds("lunar-lander", SETTINGS, 4)
     worlds.max_episode_steps = 60
     single = [
         gymnasium.make("irlcli/LunarLander-v0", engine_power=p).unwrapped for p in (1, 1, 1.5, 1.5)
@@ -45,12 +46,12 @@ def test_equals_single_environments_with_resets_and_time_limit():
     assert episodes >= 8
 
 
-def test_shares_are_equal_and_setting_major():
-    worlds = rl.make_worlds("lunar-lander", SETTINGS, 6)
+def test_settings_have_equal_shares_in_order():
+    worlds = make_worlds("lunar-lander", SETTINGS, 6)
     assert [env.engine_power for env in worlds.envs] == [1.0] * 3 + [1.5] * 3
-    np.testing.assert_array_equal(rl.world_groups(6, 2), [0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(world_settings(6, 2), [0, 0, 0, 1, 1, 1])
 
 
-def test_no_environment_is_refused():
+def test_an_empty_list_of_environments_is_rejected():
     with pytest.raises(ValueError, match="at least one"):
         VectorWorlds([], 10)

@@ -1,4 +1,4 @@
-"""Worker processes: the same numbers as one process, and no silent or lasting failure."""
+"""Worker processes give the same results as one process, and their failures are reported."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FACTORIES = [
 
 
 class Fragile(gymnasium.Env):
-    """Counts its steps; raises, or kills its process, at a given one."""
+    """Counts its steps; raises an error, or kills its process, at a given step."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
@@ -82,7 +82,7 @@ def roll_out(worlds, steps: int = 12) -> list:
     return out
 
 
-def test_numbers_do_not_depend_on_the_number_of_workers():
+def test_results_do_not_depend_on_the_number_of_workers():
     expected = roll_out(VectorWorlds([make() for make in FACTORIES], max_episode_steps=5))
     for workers in (1, 2, 3):
         actual = roll_out(WorkerWorlds(FACTORIES, max_episode_steps=5, workers=workers))
@@ -91,7 +91,7 @@ def test_numbers_do_not_depend_on_the_number_of_workers():
             np.testing.assert_array_equal(a, b)
 
 
-def test_has_the_worlds_spaces_and_length():
+def test_has_the_environments_spaces_and_number():
     worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
     assert len(worlds) == 3
     assert worlds.observation_space.shape == (17,)
@@ -110,7 +110,7 @@ def test_steps_discrete_actions():
     worlds.close()
 
 
-def test_an_environments_error_names_worker_and_worlds():
+def test_an_environments_error_names_the_worker_and_its_worlds():
     worlds = WorkerWorlds(
         [Fragile, Fragile, partial(Fragile, fail_at=2)], max_episode_steps=100, workers=2
     )
@@ -125,7 +125,7 @@ def test_an_environments_error_names_worker_and_worlds():
         worlds.step(np.zeros(3, dtype=np.int64))
 
 
-def test_a_dead_worker_is_noticed_and_the_others_are_ended():
+def test_a_dead_worker_is_reported_and_the_others_are_ended():
     worlds = WorkerWorlds([Fragile, partial(Fragile, die_at=2)], max_episode_steps=100, workers=2)
     pids = [process.pid for process in worlds._processes]
     worlds.reset([0, 0])
@@ -146,7 +146,7 @@ if __name__ == "__main__":
     worlds = WorkerWorlds([Fragile] * 2, max_episode_steps=100, workers=2)
     worlds.reset([0, 0])
     print(*[process.pid for process in worlds._processes], flush=True)
-    # Not for ever: the test itself may be killed.
+    # A limit, because the test itself may be killed.
     end = time.monotonic() + 120
     while time.monotonic() < end:
         worlds.step(np.zeros(2, dtype=np.int64))
@@ -170,7 +170,7 @@ def test_no_worker_outlives_its_parent(stop, tmp_path):
     assert len(pids) == 2
     assert all(alive(pid) for pid in pids)
     if stop == signal.SIGINT:
-        os.killpg(parent.pid, stop)  # as a terminal's Ctrl-C does
+        os.killpg(parent.pid, stop)  # as Ctrl-C in a terminal does
     else:
         os.kill(parent.pid, stop)
     parent.wait(timeout=20)
@@ -187,7 +187,7 @@ def test_no_worker_outlives_its_parent(stop, tmp_path):
         (np.full((3, 6), np.nan), "finite"),
     ],
 )
-def test_bad_actions_are_refused_and_the_workers_go_on(actions, message):
+def test_invalid_actions_are_rejected_and_the_workers_continue(actions, message):
     worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
     worlds.reset(SEEDS)
     with pytest.raises(ValueError, match=message):
@@ -197,12 +197,12 @@ def test_bad_actions_are_refused_and_the_workers_go_on(actions, message):
 
 
 @pytest.mark.parametrize("workers", [0, 4])
-def test_a_senseless_number_of_workers_is_refused(workers):
+def test_a_number_of_workers_out_of_range_is_rejected(workers):
     with pytest.raises(ValueError, match=rf"\[1, 3\], not {workers}"):
         WorkerWorlds(FACTORIES, max_episode_steps=5, workers=workers)
 
 
-def test_a_wrong_number_of_seeds_is_refused():
+def test_a_wrong_number_of_seeds_is_rejected():
     worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
     with pytest.raises(ValueError, match="3 seeds are needed, not 2"):
         worlds.reset([0, 1])

@@ -1,7 +1,7 @@
 """The PyBullet Ant with the interventions of the paper's Sec. 5.2 and Table 2.
 
-Observation, reward and physics are those of pybullet-gym's AntMuJoCoEnv, without the 84
-observation entries that are always zero.
+Observation, reward and physics equal those of pybullet-gym's AntMuJoCoEnv, except that the 84
+observation entries that are always zero are omitted.
 """
 
 from __future__ import annotations
@@ -12,52 +12,41 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from irlcli.envs.bullet.body import FROM_TO_MARGIN, Capsule, Link, Vector, box_inertia, single
 from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.episode import RobotEnv
-from irlcli.envs.bullet.world import (
-    FROM_TO_MARGIN,
-    SUBSTEPS,
-    TIME_STEP,
-    Capsule,
-    Goal,
-    Link,
-    Robot,
-    Vector,
-    World,
-    box_inertia,
-    moving_joints,
-    require,
-    require_friction,
-    require_model,
-    single,
-)
+from irlcli.envs.bullet.robot import Robot
+from irlcli.envs.bullet.walker import Walker
+from irlcli.envs.bullet.world import SUBSTEPS, TIME_STEP, World
 
 _RADIUS = single(0.08)
 _FIXED = _UPPER = single(0.2)
 _LOWER = single(0.4)
 _START_HEIGHT = 0.75
-# The importer's single-precision radians of 40, 30 and 100 degrees.
+# 40, 30 and 100 degrees in the single-precision radians of Bullet's importer.
 _HIP = 0.6981317400932312
 _ANKLE = (0.5235987901687622, 1.7453292608261108)
-# Legs in the original's order: x and y of the leg's direction, the ankle's axis, its sign.
+# For each leg, in the original's order: x and y of its direction, the ankle's axis, and the
+# sign of the ankle's range.
 _LEGS = (
     (1.0, 1.0, (-1.0, 1.0, 0.0), 1.0),
     (-1.0, 1.0, (1.0, 1.0, 0.0), -1.0),
     (-1.0, -1.0, (-1.0, 1.0, 0.0), -1.0),
     (1.0, -1.0, (1.0, 1.0, 0.0), 1.0),
 )
-# Middle of each joint's range, and how far from it the original calls a joint at its limit.
+# For each joint: the middle of its range, and the distance from it beyond which the original
+# counts the joint as at its limit.
 _RANGES = tuple(
     (sign * 0.5 * (low + high), 0.99 * 0.5 * (high - low))
     for *_, sign in _LEGS
     for low, high in ((-_HIP, _HIP), _ANKLE)
 )
-# The original measures progress at the mean of its 20 links, its torso and the floor.
+# The original measures progress at the mean position of its 20 links, its torso and the floor.
 _PARTS = 22
 
 
-def _segment(x: float, y: float, length: float) -> tuple[Capsule, float, tuple]:
-    """A leg's capsule from the origin to ``length * (x, y)``, its mass and inertia."""
+def _segment(x: float, y: float, length: float) -> tuple[Capsule, float, Vector]:
+    """A leg's capsule from the origin to ``length * (x, y)``, with its mass and inertia."""
     capsule = Capsule((0.0, 0.0, 0.0), (x * length, y * length, 0.0), _RADIUS)
     thickness = 2.0 * (_RADIUS + FROM_TO_MARGIN)
     width = length + thickness
@@ -65,7 +54,7 @@ def _segment(x: float, y: float, length: float) -> tuple[Capsule, float, tuple]:
 
 
 def _joints_at_limit(angles: list[float]) -> int:
-    """How many of the 8 joints are at a limit, or beyond it."""
+    """The number of the 8 joints that are at or beyond a limit."""
     return sum(
         [
             abs(angle - middle) > tolerance
@@ -77,9 +66,9 @@ def _joints_at_limit(angles: list[float]) -> int:
 def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
     """The Ant's base and its 8 links, in the original's joint order.
 
-    The torso and the four capsules fixed to it are one body: 8 links where the original has
-    20. ``leg_length`` multiplies both moving segments of the two hind legs, whose masses
-    follow their volume.
+    The torso and the four capsules fixed to it form one body, so 8 links replace the
+    original's 20. ``leg_length`` multiplies both moving segments of the two hind legs. Their
+    masses are proportional to their volumes.
     """
     torso = Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.25)
     mass = torso.mass
@@ -91,7 +80,7 @@ def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
         fixed, fixed_mass, fixed_inertia = _segment(x, y, _FIXED)
         shapes.append(fixed)
         mass += fixed_mass
-        # Parallel axes; the products of inertia of the four capsules cancel.
+        # Parallel axis theorem. The products of inertia of the four capsules cancel.
         square = fixed.center[0] ** 2
         moments += np.array(fixed_inertia) + fixed_mass * np.array([square, square, 2 * square])
         for parent, anchor, length, joint_axis, limits in (
@@ -121,31 +110,27 @@ def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
 
 
 class Ant(RobotEnv):
-    """A four-legged walker, pulled toward a goal 1 km away.
+    """A four-legged robot that walks toward a goal 1 km away.
 
     Observation [27] float32: height and orientation quaternion (x, y, z, w) of the torso, 8
-    joint angles, linear and angular velocity of the torso in world axes, 8 joint speeds; then
-    the unit vector to the goal [2] where ``goal_y`` or ``direction`` is given. Action [8]:
-    torques of hip and ankle of each leg in units of 250 N m, clipped to [-1, 1].
+    joint angles, linear and angular velocity of the torso in world axes, 8 joint speeds. With
+    ``goal_y`` or ``direction``, the unit vector to the goal [2] follows. Action [8]: torques of
+    hip and ankle of each leg in units of 250 N m, clipped to [-1, 1].
 
     The reward is the sum of the terms in ``info``: ``alive`` (always 1), ``progress`` (m/s
-    toward the goal) and ``joints_at_limit`` (-0.1 per joint). An episode never terminates.
-    A world whose state is no longer finite truncates the episode at its last finite
-    observation, pays nothing, and says so in ``info["error"]``.
+    toward the goal) and ``joints_at_limit`` (-0.1 per joint). An episode never terminates; see
+    :class:`irlcli.envs.bullet.episode.RobotEnv` for the one case in which it is truncated.
 
     Args:
-        mass: multiplier of every link's mass and inertia, in [0.1, 10].
-        friction: tangential, torsional and rolling coefficient of every link, in [0, 10];
-            Bullet multiplies the coefficients of two touching bodies, and the floor's is 0.8.
-        leg_length: multiplier of the hind legs' two moving segments, in [0.2, 5].
-        goal_y, direction: see :class:`irlcli.envs.bullet.world.Goal`.
-        full_observation: the original's [111] numbers, of which 84 are always zero.
+        mass, friction, goal_y, direction: see :class:`irlcli.envs.bullet.walker.Walker`.
+        leg_length: multiplier of the two moving segments of each hind leg, in [0.2, 5].
+        full_observation: whether to observe the original's [111] numbers, of which 84 are zero.
         model: ``"merged"`` or ``"original"`` (20 links; its legs cannot change).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
     Raises:
-        ValueError: a value outside the range given.
-        RuntimeError: ``"human"`` without a display.
+        ValueError: a value is outside its range.
+        RuntimeError: the render mode is ``"human"`` and no display answers.
     """
 
     start_range = (0.1,) * 8
@@ -163,38 +148,25 @@ class Ant(RobotEnv):
         model: str = "merged",
         render_mode: str | None = None,
     ):
-        self.mass = require("mass", mass, 0.1, 10.0)
-        self.friction = require_friction(friction)
-        self.leg_length = require("leg_length", leg_length, 0.2, 5.0)
-        self.model = require_model(model, self.leg_length)
-        self.goal = Goal(goal_y, direction)
+        self._walker = Walker(mass, friction, leg_length, goal_y, direction, model)
         self._zeros = [0.0] * 84 if full_observation else []
-        # What each leg adds to the sum of the links' positions, hips aside: 2.5 upper segments
-        # (its middle once, its end twice) and half a lower one. A leg's direction in the
-        # torso's plane is a complex number.
+        # What each leg adds to the sum of its links' positions, except for the hip: 2.5 upper
+        # segments (its middle once, its end twice) and half a lower one. A complex number
+        # represents the leg's direction in the torso's plane.
         self._legs = []
         for x, y, _, sign in _LEGS:
-            scale = self.leg_length if y < 0 else 1.0
-            direction = scale * complex(x, y)
+            scale = self._walker.leg_length if y < 0 else 1.0
+            leg = scale * complex(x, y)
             drop = -0.5 * math.sqrt(2.0) * _LOWER * scale * sign
-            self._legs.append((2.5 * _UPPER * direction, 0.5 * _LOWER * direction, drop))
-        size = 27 + len(self._zeros) + 2 * self.goal.observed
+            self._legs.append((2.5 * _UPPER * leg, 0.5 * _LOWER * leg, drop))
+        size = 27 + len(self._zeros) + 2 * self._walker.goal.observed
         super().__init__(World(render_mode), size, render_mode)
 
     def _place(self, positions: np.ndarray) -> Robot:
-        self._goal = self.goal.draw(self.np_random)
-        self._tail = self._zeros + self.goal.observation(self._goal)
-        client = self._world.client
-        if self.model == "original":
-            (body,) = self._world.load("ant.xml", pybullet.MJCF_COLORS_FROM_FILE)
-            joints = moving_joints(client, body)
-        else:
-            body = self._world.build(*morphology(self.leg_length), (0.0, 0.0, _START_HEIGHT))
-            joints = list(range(8))
-        robot = Robot(client, body, joints, joints)
-        robot.set_friction(self.friction)
-        if self.mass != 1.0:
-            robot.scale_mass(self.mass)
+        self._goal = self._walker.goal.draw(self.np_random)
+        self._tail = self._zeros + self._walker.goal.observation(self._goal)
+        start = (0.0, 0.0, _START_HEIGHT)
+        robot = self._walker.create(self._world.client, "ant.xml", morphology, start)
         if self.render_mode is not None:
             robot.paint((0.8, 0.5, 0.3, 1.0))
         robot.place(positions)
@@ -210,7 +182,7 @@ class Ant(RobotEnv):
         return self._position
 
     def _observe(self) -> tuple[np.ndarray, float]:
-        """The observation, and minus the distance to go over the time step."""
+        """The observation, and minus the distance to the goal divided by the time step."""
         client, body = self._robot.client, self._robot.body
         self._position, orientation = pybullet.getBasePositionAndOrientation(body, client)
         linear, angular = pybullet.getBaseVelocity(body, client)
@@ -240,9 +212,9 @@ class Ant(RobotEnv):
     ) -> tuple[float, float]:
         """x and y of the mean over the original's 20 links, its torso and the floor.
 
-        The original takes the links' positions from Bullet's cache, which is one substep old,
-        but not the torso's. The four hips' positions cancel in the sum, so what is left of it
-        is the legs', in closed form: cheaper than asking Bullet.
+        The original reads the links' positions, but not the torso's, from Bullet's cache, which
+        is one substep old. The positions of the four hips cancel in the sum. The legs' share is
+        computed in closed form, which is cheaper than a call of Bullet.
         """
         lag = TIME_STEP / SUBSTEPS
         plane, height = 0j, 0.0
@@ -256,7 +228,7 @@ class Ant(RobotEnv):
         scale = -math.sin(half) / rate if rate > 0.0 else 0.0
         a, b, c, w = scale * angular[0], scale * angular[1], scale * angular[2], math.cos(half)
         i, j, k, r = orientation
-        # The torso's quaternion one substep ago.
+        # The torso's quaternion, one substep ago.
         i, j, k, r = (
             w * i + a * r + b * k - c * j,
             w * j - a * k + b * r + c * i,

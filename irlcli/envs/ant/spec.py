@@ -1,4 +1,4 @@
-"""Ant's knobs (paper Table 2)."""
+"""Ant: interventions and time limit (paper Table 2)."""
 
 from irlcli.envs.bullet.knobs import WALKER_KNOBS
 from irlcli.envs.spec import EnvironmentSpec, Knob

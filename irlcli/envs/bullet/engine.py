@@ -1,7 +1,7 @@
 """PyBullet, imported without its banner.
 
-PyBullet's C code writes its build time to stderr on import. A line there would spoil what reads
-``--json`` with stderr merged into stdout.
+PyBullet's C code writes its build time to stderr on import. That line would corrupt the output of
+``--json`` for a caller who merges stderr into stdout.
 """
 
 import importlib
@@ -12,9 +12,10 @@ _BANNER = b"pybullet build time:"
 
 
 def _import_without_banner() -> None:
+    """Import pybullet, and forward what it writes to stderr, except for the banner."""
     try:
         stderr = os.dup(2)
-    except OSError:  # stderr is closed: nothing can be written to it
+    except OSError:  # stderr is closed, so the banner goes nowhere
         importlib.import_module("pybullet")
         return
     with tempfile.TemporaryFile() as caught:

@@ -1,4 +1,4 @@
-"""The frame of an episode, which all robots share."""
+"""An episode of a robot environment: reset, step, render."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from irlcli.envs.bullet.world import TIME_STEP, Robot, Vector, World, has_display
+from irlcli.envs.bullet.body import Vector
+from irlcli.envs.bullet.robot import Robot
+from irlcli.envs.bullet.world import TIME_STEP, World, has_display
 
 _NOT_FINITE = "the state of the world is not finite"
 
 
 class RobotEnv(gymnasium.Env, abc.ABC):
-    """One robot in a world of its own; no episode terminates.
+    """One robot in its own world.
 
-    A world whose state is no longer finite truncates the episode at its last finite
-    observation, pays nothing, and says so in ``info["error"]``.
+    An episode never terminates. If the world's state becomes infinite or NaN, the episode is
+    truncated: the step returns the last finite observation, reward 0 and ``info["error"]``.
 
     Args:
-        world: where the robot lives; closed with the environment.
-        observations: size of an observation.
+        world: the robot's world, which :meth:`close` closes.
+        observations: number of entries of an observation.
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
     """
 
@@ -31,47 +33,47 @@ class RobotEnv(gymnasium.Env, abc.ABC):
         "render_modes": ["human", "rgb_array"],
         "render_fps": round(1.0 / TIME_STEP),
     }
-    #: Start positions are drawn uniformly from this far on either side of zero.
+    #: Start positions are drawn uniformly from +- these values.
     start_range: ClassVar[Sequence[float]]
-    #: Torques [A] of an action of ones.
+    #: Torques [A] that an action of ones applies.
     torques: ClassVar[np.ndarray]
-    #: Distance of the camera from what it looks at, and its pitch in degrees.
+    #: The camera's distance from its target, and its pitch in degrees.
     camera: ClassVar[tuple[float, float]]
 
     def __init__(self, world: World, observations: int, render_mode: str | None):
         self._world = world
         self.render_mode = render_mode
         if not has_display():
-            # Gymnasium's checker tries every mode that is offered.
+            # Gymnasium's checker tries every render mode in the metadata.
             self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (observations,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self.torques.shape, np.float32)
 
     @abc.abstractmethod
     def _place(self, positions: np.ndarray) -> Robot:
-        """Draw what else an episode draws; the robot at ``positions``, in the empty world."""
+        """Create the robot at ``positions`` in the empty world, and draw the episode's goal."""
 
     @abc.abstractmethod
     def _observe(self) -> tuple[np.ndarray, float]:
-        """The observation, and the potential that progress is a gain of."""
+        """The observation, and the potential whose increase is the progress."""
 
     @abc.abstractmethod
     def _reward(
         self, action: np.ndarray, observation: np.ndarray, gain: float
     ) -> tuple[float, dict[str, float]]:
-        """The reward of a step that gained this much potential, and its terms."""
+        """The reward and its terms, for a step in which the potential grew by ``gain``."""
 
     @abc.abstractmethod
     def _focus(self) -> Vector:
-        """Where the camera looks."""
+        """The camera's target."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; ``options["joint_positions"]`` replaces the drawn start.
+        """Start an episode; ``options["joint_positions"]`` replaces the random start positions.
 
         Raises:
-            ValueError: another option, another shape, or a number that is not finite.
+            ValueError: an unknown option, or positions of a wrong shape or not finite.
         """
         super().reset(seed=seed)
         positions = _start_positions(options, len(self.start_range))
@@ -83,10 +85,10 @@ class RobotEnv(gymnasium.Env, abc.ABC):
         return self._observation, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance 0.0165 s.
+        """Advance 0.0165 s; ``action`` [A] is clipped to [-1, 1].
 
         Raises:
-            ValueError: an action of another shape, or not finite.
+            ValueError: an action of a wrong shape, or not finite.
         """
         action = _clipped(action, self.torques.shape)
         self._robot.drive(self.torques * action)
@@ -102,7 +104,7 @@ class RobotEnv(gymnasium.Env, abc.ABC):
         return observation, reward, False, False, info
 
     def render(self) -> np.ndarray | None:
-        """A picture of the robot [240, 320, 3] uint8; ``None`` unless ``"rgb_array"``."""
+        """A picture of the robot [240, 320, 3] uint8 in mode ``"rgb_array"``, else ``None``."""
         if self.render_mode != "rgb_array":
             return None
         return self._world.image(self._focus(), self.camera)
@@ -113,16 +115,16 @@ class RobotEnv(gymnasium.Env, abc.ABC):
 
 
 def _is_finite(array: np.ndarray) -> bool:
-    """Whether every number of a vector is finite (and far below overflow)."""
-    # One product of the vector with itself is much cheaper than ``np.isfinite(...).all()``.
+    """Whether every entry of a vector is finite, and small enough to be squared."""
+    # The dot product is much cheaper than ``np.isfinite(array).all()``.
     return math.isfinite(array.dot(array))
 
 
 def _clipped(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """``action`` of ``shape`` as float64, clipped to the actuators' range [-1, 1].
+    """``action`` as float64, clipped to the actuators' range [-1, 1].
 
     Raises:
-        ValueError: another shape, or a number that is not finite.
+        ValueError: ``action`` does not have ``shape``, or is not finite.
     """
     action = np.asarray(action, dtype=np.float64)
     if action.shape != shape:
@@ -132,11 +134,11 @@ def _clipped(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.minimum(np.maximum(action, -1.0), 1.0)
 
 
-def _start_positions(options: dict | None, size: int) -> np.ndarray | None:
-    """``options["joint_positions"]`` [size] of a reset, or ``None`` where not given.
+def _start_positions(options: dict[str, Any] | None, size: int) -> np.ndarray | None:
+    """``options["joint_positions"]`` [size] of a reset, or ``None`` without options.
 
     Raises:
-        ValueError: another option, another shape, or a number that is not finite.
+        ValueError: an unknown option, or positions of a wrong shape or not finite.
     """
     if not options:
         return None

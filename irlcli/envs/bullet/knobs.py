@@ -1,4 +1,4 @@
-"""The knobs that Ant and HalfCheetah share (paper Table 2)."""
+"""The interventions that Ant and HalfCheetah share (paper Table 2)."""
 
 from irlcli.envs.spec import Knob
 
@@ -12,7 +12,7 @@ WALKER_KNOBS = {
         ("absolute", "range"),
         -180.0,
         180.0,
-        "direction of the goal, degrees from ahead",
+        "direction of the goal, in degrees from straight ahead",
         observed=True,
     ),
     "friction": Knob(

@@ -1,7 +1,7 @@
 """The PyBullet HalfCheetah with the interventions of the paper's Sec. 5.2 and Table 2.
 
-Observation and physics are those of pybullet-gym's HalfCheetahMuJoCoEnv, and so is the reward
-while the goal is straight ahead.
+Observation and physics equal those of pybullet-gym's HalfCheetahMuJoCoEnv. The reward is also
+equal as long as the goal is straight ahead.
 """
 
 from __future__ import annotations
@@ -13,25 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from irlcli.envs.bullet.body import FROM_TO_MARGIN, Capsule, Link, Vector, box_inertia, single
 from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.episode import RobotEnv
-from irlcli.envs.bullet.world import (
-    FROM_TO_MARGIN,
-    SUBSTEPS,
-    TIME_STEP,
-    Capsule,
-    Goal,
-    Link,
-    Robot,
-    Vector,
-    World,
-    box_inertia,
-    moving_joints,
-    require,
-    require_friction,
-    require_model,
-    single,
-)
+from irlcli.envs.bullet.robot import Robot
+from irlcli.envs.bullet.walker import Walker
+from irlcli.envs.bullet.world import SUBSTEPS, TIME_STEP, World
 
 _RADIUS = single(0.046)
 _START_HEIGHT = single(0.7)
@@ -39,10 +26,10 @@ _TORSO_LINK = 2
 
 
 class _Segment(NamedTuple):
-    """A leg's segment in the plane of motion: x is forward, z is up.
+    """A segment of a leg in the plane of motion, in which x is forward and z is up.
 
-    Its capsule's middle is (x, z) and the capsule is turned by ``angle`` about y; ``mass`` is
-    that of the capsule's volume where it is ``None``.
+    ``middle`` is the capsule's midpoint, and ``angle`` its rotation about y. If ``mass`` is
+    ``None``, the mass follows from the capsule's volume.
     """
 
     parent: int
@@ -54,7 +41,8 @@ class _Segment(NamedTuple):
     mass: float | None = None
 
 
-# Back thigh, shin and foot, then front. Links 0 and 1 slide the torso, link 2, along x and z.
+# Thigh, shin and foot of the back leg, then of the front leg. Their links are 3 to 8; links 0
+# and 1 slide the torso, which is link 2, along x and z.
 _SEGMENTS = (
     _Segment(2, (-0.5, 0.0), (0.1, -0.13), -3.8, 0.145, (-0.52, 1.05)),
     _Segment(3, (0.16, -0.25), (-0.14, -0.07), -2.03, 0.15, (-0.785, 0.785)),
@@ -66,13 +54,16 @@ _SEGMENTS = (
 
 
 def _capsule(x: float, z: float, angle: float, half_length: float) -> Capsule:
-    """A capsule in the plane of motion, ``angle`` being its turn from z about y."""
+    """A capsule in the plane of motion, rotated by ``angle`` from z about y."""
     dx, dz = half_length * math.sin(angle), half_length * math.cos(angle)
     return Capsule((x - dx, 0.0, z - dz), (x + dx, 0.0, z + dz), _RADIUS)
 
 
 def _bounds(capsule: Capsule) -> np.ndarray:
-    """Lower and upper corner [2, 3] of Bullet's bounding box: of the box around the capsule."""
+    """Lower and upper corner [2, 3] of Bullet's bounding box.
+
+    Bullet encloses the capsule in a box along its axis, and that box in an upright one.
+    """
     half = 0.5 * (np.array(capsule.end) - np.array(capsule.start))
     half_length = np.linalg.norm(half)
     sine, cosine = np.abs(half[[0, 2]]) / half_length
@@ -83,11 +74,11 @@ def _bounds(capsule: Capsule) -> np.ndarray:
 
 
 def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
-    """The HalfCheetah's fixed base and its 9 links.
+    """The HalfCheetah's fixed base and its 9 links, which replace the original's 16.
 
-    9 links where the original has 16. ``leg_length`` multiplies every length of both legs but
-    the capsules' radius; the feet keep their 10 kg, the other masses follow the volume. The
-    start height keeps the lowest point as far above the ground as the original's.
+    ``leg_length`` multiplies every length of both legs except the capsules' radius. The feet
+    keep their 10 kg; the other masses are proportional to their volumes. The start height keeps
+    the original's distance between the lowest point and the ground.
     """
     massless = Link(0.0, (0.0, 0.0, 0.0))
     height = _START_HEIGHT + (leg_length - 1.0) * _leg_height()
@@ -124,7 +115,7 @@ def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
         )
         lower_corner, upper_corner = _bounds(capsule)
         mass = capsule.mass if segment.mass is None else segment.mass
-        # The hips are the torso's; only what hangs below them is the leg's.
+        # The hips belong to the torso, so their positions on it do not scale.
         scale = 1.0 if segment.parent == _TORSO_LINK else leg_length
         links.append(
             Link(
@@ -141,7 +132,7 @@ def morphology(leg_length: float = 1.0) -> tuple[Link, list[Link]]:
 
 
 def _leg_height() -> float:
-    """How far a leg's lowest capsule axis is below its hip with all joints at zero."""
+    """Distance from the hips down to the lowest capsule axis, with all joints at zero."""
     lowest = []
     for hip in (0, 3):
         height = 0.0
@@ -153,32 +144,29 @@ def _leg_height() -> float:
 
 
 class HalfCheetah(RobotEnv):
-    """A planar runner.
+    """A two-legged robot that runs in a vertical plane.
 
     Observation [17] float32: height (relative to the start) and pitch of the torso, 6 joint
-    angles, then the speeds of forward motion, height, pitch and the 6 joints; then the unit
-    vector to the goal [2] where ``goal_y`` or ``direction`` is given. Action [6]: torques of
-    back thigh, shin and foot, then front, in units of 120, 90, 60, 140, 60 and 30 N m, clipped
-    to [-1, 1].
+    angles, then the speeds of forward motion, height, pitch and the 6 joints. With ``goal_y`` or
+    ``direction``, the unit vector to the goal [2] follows. Action [6]: torques of thigh, shin
+    and foot of the back leg, then of the front leg, in units of 120, 90, 60, 140, 60 and 30 N m,
+    clipped to [-1, 1].
 
-    The reward is the sum of the terms in ``info``: ``progress``, the velocity (m/s) along the
-    goal's direction, which for a planar runner is its forward velocity times the direction's
-    cosine, and ``control``, -0.1 times the squared clipped action. An episode never
-    terminates. A world whose state is no longer finite truncates the episode at its last
-    finite observation, pays nothing, and says so in ``info["error"]``.
+    The reward is the sum of the terms in ``info``. ``progress`` is the velocity (m/s) along the
+    direction of the goal; in the plane this is the forward velocity times the cosine of that
+    direction. ``control`` is -0.1 times the squared norm of the clipped action. An episode never
+    terminates; see :class:`irlcli.envs.bullet.episode.RobotEnv` for the one case in which it is
+    truncated.
 
     Args:
-        mass: multiplier of every link's mass and inertia, in [0.1, 10].
-        friction: tangential, torsional and rolling coefficient of every link, in [0, 10];
-            Bullet multiplies the coefficients of two touching bodies, and the floor's is 0.8.
-        leg_length: multiplier of both legs' lengths, in [0.2, 5].
-        goal_y, direction: see :class:`irlcli.envs.bullet.world.Goal`.
+        mass, friction, goal_y, direction: see :class:`irlcli.envs.bullet.walker.Walker`.
+        leg_length: multiplier of the lengths of both legs, in [0.2, 5].
         model: ``"merged"`` or ``"original"`` (16 links; its legs cannot change).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
     Raises:
-        ValueError: a value outside the range given.
-        RuntimeError: ``"human"`` without a display.
+        ValueError: a value is outside its range.
+        RuntimeError: the render mode is ``"human"`` and no display answers.
     """
 
     start_range = (0.1,) * 9
@@ -195,28 +183,18 @@ class HalfCheetah(RobotEnv):
         model: str = "merged",
         render_mode: str | None = None,
     ):
-        self.mass = require("mass", mass, 0.1, 10.0)
-        self.friction = require_friction(friction)
-        self.leg_length = require("leg_length", leg_length, 0.2, 5.0)
-        self.model = require_model(model, self.leg_length)
-        self.goal = Goal(goal_y, direction)
-        super().__init__(World(render_mode), 17 + 2 * self.goal.observed, render_mode)
+        self._walker = Walker(mass, friction, leg_length, goal_y, direction, model)
+        super().__init__(World(render_mode), 17 + 2 * self._walker.goal.observed, render_mode)
 
     def _place(self, positions: np.ndarray) -> Robot:
-        goal = self.goal.draw(self.np_random)
+        goal = self._walker.goal.draw(self.np_random)
         self._cosine = goal[0] / math.hypot(*goal)
-        self._tail = self.goal.observation(goal)
-        client = self._world.client
-        if self.model == "original":
-            (body,) = self._world.load("half_cheetah.xml", pybullet.MJCF_COLORS_FROM_FILE)
-            joints = moving_joints(client, body)
-        else:
-            body = self._world.build(*morphology(self.leg_length), (0.0, 0.0, 0.0))
-            joints = list(range(9))
-        robot = Robot(client, body, joints, joints[3:])
-        robot.set_friction(self.friction)
-        if self.mass != 1.0:
-            robot.scale_mass(self.mass)
+        self._tail = self._walker.goal.observation(goal)
+        start = (0.0, 0.0, 0.0)
+        # The first three joints move the torso: forward, up and in pitch.
+        robot = self._walker.create(
+            self._world.client, "half_cheetah.xml", morphology, start, passive_joints=3
+        )
         if self.render_mode is not None:
             robot.paint((0.8, 0.6, 0.4, 1.0))
         robot.place(positions)
@@ -230,13 +208,13 @@ class HalfCheetah(RobotEnv):
         return progress + control, {"progress": progress, "control": control}
 
     def _observe(self) -> tuple[np.ndarray, float]:
-        """The observation, and how far forward the torso is."""
+        """The observation, and the torso's forward position."""
         positions, speeds = self._robot.states()
         values = [*positions[1:], *speeds, *self._tail]
         observation = np.fromiter(values, np.float32, len(values))
-        # The original reads a link's cached position, which is one substep old.
+        # The original reads the position from Bullet's cache, which is one substep old.
         return observation, positions[0] - speeds[0] * TIME_STEP / SUBSTEPS
 
     def _focus(self) -> Vector:
-        link = _TORSO_LINK if self.model == "merged" else _TORSO_LINK + 1
+        link = _TORSO_LINK if self._walker.model == "merged" else _TORSO_LINK + 1
         return pybullet.getLinkState(self._robot.body, link, physicsClientId=self._world.client)[0]

@@ -1,4 +1,4 @@
-"""HalfCheetah's knobs (paper Table 2)."""
+"""HalfCheetah: interventions and time limit (paper Table 2)."""
 
 from irlcli.envs.bullet.knobs import WALKER_KNOBS
 from irlcli.envs.spec import EnvironmentSpec, Knob

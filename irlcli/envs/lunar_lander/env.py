@@ -1,12 +1,13 @@
 """LunarLander with interventions on bounce, friction and engine power (paper Table 2).
 
-The physics, the observation and the reward are gymnasium's LunarLander-v3, discrete actions;
-an intervention changes one constant of one instance and nothing of any other.
+Physics, observation and reward are those of gymnasium's LunarLander-v3 with discrete actions. An
+intervention changes a constant of one instance and does not affect other instances.
 """
 
 from __future__ import annotations
 
 import types
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,12 @@ from gymnasium.envs.box2d import lunar_lander as original
 from gymnasium.utils import EzPickle
 
 
-def _bind(function: types.FunctionType, **constants: float) -> types.FunctionType:
-    """``function`` with its own values for some of its module's constants.
+def _bind(function: Callable[..., Any], **constants: float) -> types.FunctionType:
+    """A copy of ``function`` that sees other values for some of its module's constants.
 
-    Gymnasium keeps the engine's power in a module-level constant. Rebinding the function's
-    globals gives one environment its own value without a copy of the step's code and without
-    touching the module that every other LunarLander of the process reads.
+    Gymnasium keeps the engine's power in a module-level constant, which all LunarLanders of a
+    process read. Replacing the globals of one copy of ``step`` changes the constant for one
+    environment, without a copy of the code.
     """
     return types.FunctionType(
         function.__code__,
@@ -34,18 +35,18 @@ class LunarLander(original.LunarLander):
     """An intervened LunarLander.
 
     Args:
-        bounce: coefficient of restitution of hull and legs, in [0, 1] (the original: 0).
-            Box2D treats contacts slower than 1 m/s as inelastic whatever the restitution.
-        friction: friction coefficient of the moon, at least 0 (the original: 0.1).
-            Box2D mixes the coefficients of two touching bodies by sqrt(f1 * f2).
-        engine_power: multiplier of the main engine's impulse, above 0 (the original: 1).
-        fixed_horizon: with a number H, an episode always lasts H steps: the state in which it
-            would have terminated absorbs, keeps its final observation, ignores actions and
-            pays nothing, and step H truncates.
+        bounce: coefficient of restitution of hull and legs, in [0, 1] (original: 0). Box2D
+            treats contacts slower than 1 m/s as inelastic, whatever the restitution.
+        friction: friction coefficient of the moon, at least 0 (original: 0.1). Between two
+            touching bodies, Box2D uses sqrt(f1 * f2).
+        engine_power: multiplier of the main engine's impulse, above 0 (original: 1).
+        fixed_horizon: if a number H, every episode is truncated after exactly H steps. A state
+            that would terminate becomes absorbing: its observation is repeated, actions have no
+            effect, and the reward is 0.
         render_mode: ``None``, ``"human"`` or ``"rgb_array"``.
 
     Raises:
-        ValueError: a value outside the range given.
+        ValueError: a value is outside its range.
     """
 
     def __init__(
@@ -79,21 +80,25 @@ class LunarLander(original.LunarLander):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; observation [8] float32."""
+        """Start an episode, and return the observation [8] float32 and an info."""
         self._absorbed = None
         observation, info = super().reset(seed=seed, options=options)
-        # The lander starts high above ground: no contact exists yet that would have been
-        # created with the original coefficients.
+        # A contact keeps the coefficients it was created with. The lander starts high above the
+        # ground, so no contact exists yet.
         for body in (self.lander, *self.legs):
             for fixture in body.fixtures:
                 fixture.restitution = self.bounce
+        assert self.moon is not None
         for fixture in self.moon.fixtures:
             fixture.friction = self.friction
         self._steps = 0
         return observation, info
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advance 1/50 s: observation [8] float32, true reward, terminated, truncated, info."""
+        """Advance 1/50 s.
+
+        Returns the observation [8] float32, the true reward, terminated, truncated and an info.
+        """
         if self.fixed_horizon is None:
             return self._original_step(self, action)
         if self._absorbed is None:

@@ -1,4 +1,4 @@
-"""LunarLander's knobs (paper Table 2)."""
+"""LunarLander: interventions and time limit (paper Table 2)."""
 
 from irlcli.envs.spec import EnvironmentSpec, Knob
 

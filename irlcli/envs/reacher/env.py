@@ -1,7 +1,7 @@
 """The PyBullet Reacher with the gravity intervention of the paper's Sec. 5.2 and Table 2.
 
-Observation, reward and physics are those of pybullet-gym's ReacherBulletEnv, but for gravity,
-which the original has none of.
+Observation, reward and physics equal those of pybullet-gym's ReacherBulletEnv, except that the
+original has no gravity.
 """
 
 from __future__ import annotations
@@ -10,22 +10,21 @@ import math
 
 import numpy as np
 
-from irlcli.envs.bullet.engine import pybullet
-from irlcli.envs.bullet.episode import RobotEnv
-from irlcli.envs.bullet.world import (
+from irlcli.envs.bullet.body import (
     FROM_TO_MARGIN,
-    GRAVITY,
-    TIME_STEP,
     Capsule,
     Link,
-    Robot,
     Vector,
-    World,
     box_inertia,
-    require,
-    require_model,
+    create_body,
     single,
 )
+from irlcli.envs.bullet.checks import require, require_model
+from irlcli.envs.bullet.engine import pybullet
+from irlcli.envs.bullet.episode import RobotEnv
+from irlcli.envs.bullet.mjcf import load_bodies
+from irlcli.envs.bullet.robot import Robot
+from irlcli.envs.bullet.world import GRAVITY, TIME_STEP, World
 
 _RADIUS = single(0.01)
 _BALL_RADIUS = 0.01
@@ -36,9 +35,9 @@ _ELBOW_LIMIT = 3.0
 
 
 def morphology() -> tuple[Link, list[Link]]:
-    """The Reacher's fixed base and its 2 links: 2 where the original has 5.
+    """The Reacher's fixed base and its 2 links, which replace the original's 5.
 
-    The fingertip's ball is one body with the lower arm that carries it.
+    The fingertip's ball and the lower arm form one body.
     """
     arm = Capsule((0.0, 0.0, 0.0), (_UPPER, 0.0, 0.0), _RADIUS)
     thickness = 2.0 * (_RADIUS + FROM_TO_MARGIN)
@@ -46,7 +45,8 @@ def morphology() -> tuple[Link, list[Link]]:
     ball = Capsule((_FINGERTIP, 0.0, 0.0), (_FINGERTIP, 0.0, 0.0), _BALL_RADIUS)
     mass = arm.mass + ball.mass
     center = (arm.mass * arm.center[0] + ball.mass * _FINGERTIP) / mass
-    # Parallel axes: both centres of mass lie on x, so only the moments about y and z grow.
+    # Parallel axis theorem. Both centres of mass lie on x, so only the moments about y and z
+    # grow.
     offset = arm.mass * (arm.center[0] - center) ** 2 + ball.mass * (_FINGERTIP - center) ** 2
     own = 0.4 * ball.mass * _BALL_RADIUS**2
     lower = (inertia[0] + own, inertia[1] + own + offset, inertia[2] + own + offset)
@@ -66,32 +66,31 @@ def morphology() -> tuple[Link, list[Link]]:
 
 
 class Reacher(RobotEnv):
-    """A two-link arm on a leaning table that moves its fingertip to a target.
+    """A two-link arm on a tilted table that moves its fingertip to a target.
 
     Observation [9] float32: target x and y, fingertip minus target x and y, cosine and sine of
-    the shoulder's angle, its speed / 10, the elbow's angle / 3, its speed / 10. Action [2]:
-    torques of shoulder and elbow in units of 0.05 N m, clipped to [-1, 1].
+    the shoulder's angle, the shoulder's speed / 10, the elbow's angle / 3, the elbow's speed /
+    10. Action [2]: torques of shoulder and elbow in units of 0.05 N m, clipped to [-1, 1].
 
-    The reward is the sum of the terms in ``info``: ``progress`` (100 times the distance gained
-    on the target), ``control`` (work and stall cost of the clipped action) and ``stuck`` (-0.1
-    with the elbow at its limit). An episode never terminates. A world whose state is no longer
-    finite truncates the episode at its last finite observation, pays nothing, and says so in
-    ``info["error"]``.
+    The reward is the sum of the terms in ``info``: ``progress`` (100 times the decrease of the
+    distance to the target), ``control`` (work and stall cost of the clipped action) and
+    ``stuck`` (-0.1 while the elbow is at its limit). An episode never terminates; see
+    :class:`irlcli.envs.bullet.episode.RobotEnv` for the one case in which it is truncated.
 
-    On a level table gravity acts along the joints' axes and turns neither: every setting would
-    be the same to the last bit. On a table that leans by ``tilt`` the sine of it pulls toward
-    -y. The motors hold the stretched arm up to 7.3 times gravity at 5 degrees, but not even
-    once on a vertical table.
+    On a level table, gravity acts along the joints' axes and turns neither joint: all settings
+    would be bit-identical. On a table tilted by ``tilt``, a share sin(tilt) of gravity acts
+    along -y. At 5 degrees the motors can hold the stretched arm against up to 7.3 times gravity;
+    on a vertical table they could not even hold it against 1 times gravity.
 
     Args:
-        gravity: multiplier of 9.8 m/s^2, in [0, 20]; the original has none.
-        tilt: of the table, degrees in [0, 90].
+        gravity: multiplier of 9.8 m/s^2, in [0, 20]. The original has none.
+        tilt: tilt of the table, degrees in [0, 90].
         model: ``"merged"`` or ``"original"`` (5 links).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
     Raises:
-        ValueError: a value outside the range given.
-        RuntimeError: ``"human"`` without a display.
+        ValueError: a value is outside its range.
+        RuntimeError: the render mode is ``"human"`` and no display answers.
     """
 
     start_range = (3.14, 3.14, 0.27, 0.27)
@@ -117,15 +116,15 @@ class Reacher(RobotEnv):
         self._target = float(positions[2]), float(positions[3])
         client = self._world.client
         if self.model == "original":
-            *_, arm, target = self._world.load("reacher.xml")
+            *_, arm, target = load_bodies(client, "reacher.xml")
             for joint, position in enumerate(self._target):
                 pybullet.resetJointState(target, joint, position, physicsClientId=client)
             robot = Robot(client, arm, (0, 2), (0, 2))
             robot.place(positions[:2])
             return robot
-        arm = self._world.build(*morphology(), (0.0, 0.0, 0.0))
+        arm = create_body(client, *morphology(), (0.0, 0.0, 0.0))
         for link in range(2):
-            # The original's geometries do not collide either.
+            # The original's arm does not collide with anything.
             pybullet.setCollisionFilterGroupMask(arm, link, 0, 0, physicsClientId=client)
         robot = Robot(client, arm, (0, 1), (0, 1))
         if self.render_mode is not None:
@@ -157,9 +156,9 @@ class Reacher(RobotEnv):
         return 0.0, 0.0, 0.0
 
     def _observe(self) -> tuple[np.ndarray, float]:
-        """The observation and -100 times the fingertip's distance to the target."""
+        """The observation, and -100 times the fingertip's distance to the target."""
         (shoulder, elbow), (shoulder_speed, elbow_speed) = self._robot.states()
-        # The original reads links' cached positions, which are one step old.
+        # The original reads link positions from Bullet's cache, which is one step old.
         upper = shoulder - TIME_STEP * shoulder_speed
         lower = upper + elbow - TIME_STEP * elbow_speed
         x = _UPPER * math.cos(upper) + _FINGERTIP * math.cos(lower) - self._target[0]

@@ -1,4 +1,4 @@
-"""Reacher's knob (paper Table 2)."""
+"""Reacher: intervention and time limit (paper Table 2)."""
 
 from irlcli.envs.spec import EnvironmentSpec, Knob
 

@@ -1,0 +1,61 @@
+"""Checks of the arguments that the robot environments take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from irlcli.envs.bullet.body import single
+
+Friction = tuple[float, float, float]
+Model = Literal["merged", "original"]
+
+
+def require(name: str, value: Any, low: float, high: float) -> float:
+    """Return ``value`` as a float.
+
+    Raises:
+        ValueError: ``value`` is not a number in [low, high].
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not low <= number <= high:
+        raise ValueError(f"{name} must lie in [{low:g}, {high:g}], not {value!r}")
+    return number
+
+
+def require_friction(friction: Sequence[float]) -> Friction:
+    """Return the tangential, torsional and rolling coefficient in the importer's precision.
+
+    Raises:
+        ValueError: ``friction`` is not three numbers in [0, 10].
+    """
+    if np.shape(friction) != (3,):
+        raise ValueError(
+            f"friction must be three numbers (tangential, torsional, rolling), not {friction!r}"
+        )
+    names = ("friction (tangential)", "friction (torsional)", "friction (rolling)")
+    tangential, torsional, rolling = (
+        single(require(name, value, 0.0, 10.0)) for name, value in zip(names, friction, strict=True)
+    )
+    return tangential, torsional, rolling
+
+
+def require_model(model: str, leg_length: float = 1.0) -> Model:
+    """Return the name of the model.
+
+    Raises:
+        ValueError: the model is unknown, or it is the original with changed legs.
+    """
+    if model == "merged":
+        return "merged"
+    if model != "original":
+        raise ValueError(f"model must be 'merged' or 'original', not {model!r}")
+    if leg_length != 1.0:
+        raise ValueError(f"leg_length must be 1 with model='original', not {leg_length!r}")
+    return "original"

@@ -1,0 +1,75 @@
+"""The interventions that Ant and HalfCheetah share, and the robot that results from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from irlcli.envs.bullet.body import Link, Vector, create_body
+from irlcli.envs.bullet.checks import require, require_friction, require_model
+from irlcli.envs.bullet.engine import pybullet
+from irlcli.envs.bullet.goal import Goal
+from irlcli.envs.bullet.mjcf import load_bodies, moving_joints
+from irlcli.envs.bullet.robot import Robot
+
+Morphology = Callable[[float], tuple[Link, list[Link]]]
+
+
+class Walker:
+    """A walking robot's interventions, checked when it is constructed.
+
+    Args:
+        mass: multiplier of every link's mass and inertia, in [0.1, 10].
+        friction: tangential, torsional and rolling coefficient of every link, each in [0, 10].
+            Bullet multiplies the coefficients of two touching bodies; the floor's is 0.8.
+        leg_length: multiplier of leg lengths, in [0.2, 5]; the robot decides which legs.
+        goal_y, direction: see :class:`irlcli.envs.bullet.goal.Goal`.
+        model: ``"merged"`` or ``"original"``, whose legs cannot change.
+
+    Raises:
+        ValueError: a value is outside its range.
+    """
+
+    def __init__(
+        self,
+        mass: float,
+        friction: Sequence[float],
+        leg_length: float,
+        goal_y: float | None,
+        direction: float | Sequence[float] | None,
+        model: str,
+    ):
+        self.mass = require("mass", mass, 0.1, 10.0)
+        self.friction = require_friction(friction)
+        self.leg_length = require("leg_length", leg_length, 0.2, 5.0)
+        self.model = require_model(model, self.leg_length)
+        self.goal = Goal(goal_y, direction)
+
+    def create(
+        self,
+        client: int,
+        file: str,
+        morphology: Morphology,
+        position: Vector,
+        passive_joints: int = 0,
+    ) -> Robot:
+        """Create the intervened robot in Bullet.
+
+        Args:
+            client: Bullet's client id.
+            file: MJCF file of the original model.
+            morphology: base and links of the merged model, as a function of ``leg_length``.
+            position: position of the merged model's base.
+            passive_joints: number of leading joints that no torque acts on.
+        """
+        if self.model == "original":
+            (body,) = load_bodies(client, file, pybullet.MJCF_COLORS_FROM_FILE)
+            joints = moving_joints(client, body)
+        else:
+            base, links = morphology(self.leg_length)
+            body = create_body(client, base, links, position)
+            joints = list(range(len(links)))
+        robot = Robot(client, body, joints, joints[passive_joints:])
+        robot.set_friction(self.friction)
+        if self.mass != 1.0:
+            robot.scale_mass(self.mass)
+        return robot
