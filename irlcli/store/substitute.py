@@ -20,7 +20,7 @@ from irlcli.store.integrity import problems
 from irlcli.store.layout import Layout
 from irlcli.store.manifest import Manifest, encode_provenance, read_provenance
 from irlcli.store.publish import place_and_claim
-from irlcli.store.read import ids
+from irlcli.store.read import held_by, ids
 from irlcli.store.scratch import Scratch
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def find_in(stores: Sequence[Store], key: str) -> Found | None:
         if artefact is not None:
             return Found(store, artefact)
         if problem is not None:
-            store.warn(f"not using the store {store.root}: {problem}")
+            store.warn(f"not copying from the store {store.root}: {problem}")
     return None
 
 
@@ -118,7 +118,9 @@ def adopt(
         OSError: the disk is full or not writable.
     """
     for ancestor in before:
-        if not (layout.root / ancestor.id).exists():
+        # Without a holder of its key, it was placed by a process that was killed before its claim.
+        present = (layout.root / ancestor.id).exists()
+        if not present or held_by(layout, ancestor.manifest.record.key) is None:
             _adopt_one(layout, source, ancestor.id, warn)
     published = _adopt_one(layout, source, artefact.id, warn)
     if published is not None:
@@ -134,7 +136,7 @@ def _adopt_one(layout: Layout, source: Layout, id16: str, warn: Warn) -> Publish
         manifest, provenance = _copy(source, id16, copy)
         return place_and_claim(layout, copy, manifest, provenance)
     except _Unusable as error:
-        warn(f"not using artefact {id16} of the store {source.root}: {error}")
+        warn(f"not copying artefact {id16} from the store {source.root}: {error}")
         return None
     finally:
         shutil.rmtree(copy, ignore_errors=True)

@@ -8,25 +8,20 @@ file system is numbered, and the process is killed, or the call fails, at every 
 
 from __future__ import annotations
 
-import builtins
 import errno
-import io
 import os
 import signal
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from every_step import ENOUGH, counter, in_child, intercept, kill_self
 
 from irlcli.store import KeyRecord, Published, Store
 
 FILES = {"reward.pt": bytes(range(256)) * 4, "nested/table.parquet": b"PAR1" * 64}
 RECORD = KeyRecord("train-airl", 1, {"seed": 0, "rate": 1e-5}, {"demonstrations": "0" * 64})
-_OS_CALLS = ("fsync", "rename", "replace", "link", "chmod", "unlink", "rmdir", "mkdir", "open")
-_SITES = [(os, name) for name in _OS_CALLS] + [(builtins, "open"), (io, "open")]
-_ENOUGH = 300  # far more calls than one publish makes
 
 
 def attempt(
@@ -44,59 +39,6 @@ def stage_output(store: Store, files: dict[str, bytes], attempt_name: str) -> Pa
         (output / name).parent.mkdir(parents=True, exist_ok=True)
         (output / name).write_bytes(data)
     return output
-
-
-class Torn:
-    """A file whose writes can be interrupted half way."""
-
-    def __init__(self, file: Any, at_call: Callable[..., None]):
-        self._file, self._at_call = file, at_call
-
-    def write(self, data: Any) -> int:
-        def half() -> None:
-            self._file.write(data[: len(data) // 2])
-            self._file.flush()
-
-        self._at_call("write", (), half)
-        return self._file.write(data)
-
-    def __enter__(self) -> Torn:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-
-def intercept(put: Callable[[Any, str, Any], None], at_call: Callable[..., None]) -> None:
-    """Announce every call that can change the file system to ``at_call(name, args, half)``."""
-
-    def wrapped(original: Callable, name: str) -> Callable:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            at_call(name, args, lambda: None)
-            result = original(*args, **kwargs)
-            writable = isinstance(result, io.IOBase) and result.writable()
-            return Torn(result, at_call) if writable else result
-
-        return call
-
-    for module, name in _SITES:
-        put(module, name, wrapped(getattr(module, name), name))
-
-
-def counter(limit: int, act: Callable[[Callable[[], None]], None], persist: bool = False):
-    """An ``at_call`` that lets ``limit`` calls pass, then acts (once, or from then on)."""
-    seen = 0
-
-    def at_call(name: str, args: tuple, half: Callable[[], None]) -> None:
-        nonlocal seen
-        seen += 1
-        if seen == limit + 1 or (persist and seen > limit):
-            act(half)
-
-    return at_call
 
 
 def assert_whole_or_absent(store: Store) -> None:
@@ -132,27 +74,9 @@ def _created(root: Path) -> Path:
 
 
 def new_stores(tmp_path: Path) -> Iterator[tuple[int, Store]]:
-    for n in range(_ENOUGH):
+    for n in range(ENOUGH):
         yield n, Store(_created(tmp_path / str(n)))
     pytest.fail("publishing never completed")
-
-
-def in_child(work: Callable[[], None]) -> int:
-    """The wait status of a forked child that does ``work`` (99 if it raises)."""
-    pid = os.fork()
-    if pid == 0:
-        code = 99
-        try:
-            work()
-            code = 0
-        finally:
-            os._exit(code)
-    return os.waitpid(pid, 0)[1]
-
-
-def kill_self(half: Callable[[], None]) -> None:
-    half()
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_sigkill_at_every_step_of_publish(tmp_path, expected_id):
@@ -174,7 +98,7 @@ def test_sigkill_at_every_step_of_publish(tmp_path, expected_id):
 
 
 def test_sigkill_at_every_step_of_create(tmp_path):
-    for n in range(_ENOUGH):
+    for n in range(ENOUGH):
         root = tmp_path / str(n)
 
         def work() -> None:
@@ -198,7 +122,7 @@ def test_sigkill_at_every_step_of_naming(tmp_path):
     new = store.publish(
         RECORD._replace(stage_version=2), stage_output(store, FILES, "out.1"), {}
     ).artefact
-    for n in range(_ENOUGH):
+    for n in range(ENOUGH):
         store.set_name("best", old)
 
         def work() -> None:

@@ -80,6 +80,67 @@ def test_from_inside_the_store_directory(empty_store, artefact, monkeypatch):
     assert store.resolve(f"./{artefact.id}/reward.pt").output == "reward.pt"
 
 
+@pytest.mark.parametrize("head", ["id", "prefix", "name"])
+@pytest.mark.parametrize("rest", ["", "/", "/reward.pt", "/nested/table.parquet"])
+@pytest.mark.parametrize("start", ["runs/", "./runs/", "runs//"])
+def test_a_path_below_runs_finds_the_artefact_in_any_store(
+    tmp_path, publish, monkeypatch, head, rest, start
+):
+    store = Store(tmp_path / "elsewhere")
+    artefact = publish(store).artefact
+    store.set_name("best", artefact)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    ref = {"id": artefact.id, "prefix": artefact.id[:3], "name": "best"}[head]
+    found = store.resolve(start + ref + rest)
+    assert (found.artefact, found.output) == (artefact, rest.strip("/") or None)
+
+
+def test_an_existing_path_below_runs_is_that_file(tmp_path, publish, monkeypatch):
+    store = Store(tmp_path / "elsewhere")
+    artefact = publish(store).artefact
+    other = publish(Store(tmp_path / "runs")).artefact
+    monkeypatch.chdir(tmp_path)
+    found = store.resolve(f"runs/{other.id}/reward.pt")
+    assert (found.artefact, found.path) == (None, Path(f"runs/{other.id}/reward.pt"))
+    # A prefix is no existing path.
+    assert store.resolve(f"runs/{other.id[:5]}/reward.pt").artefact == artefact
+
+
+@pytest.mark.parametrize(
+    "ref",
+    [
+        "runs",
+        "runs/",
+        "runs/nothing",
+        "runs/fff/reward.pt",
+        "runs/../ID/reward.pt",
+        "runs/../../ID",
+        "other/ID/reward.pt",
+        "/runs/ID",
+        "runs/runs/ID",
+        "runs/.names/best",
+    ],
+)
+def test_other_paths_find_nothing_in_another_store(tmp_path, publish, monkeypatch, ref):
+    store = Store(tmp_path / "elsewhere")
+    artefact = publish(store).artefact
+    store.set_name("best", artefact)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(NotFound):
+        store.resolve(ref.replace("ID", artefact.id))
+
+
+def test_a_mistyped_name_below_runs_is_suggested(tmp_path, publish, monkeypatch):
+    store = Store(tmp_path / "elsewhere")
+    store.set_name("airl-irm-seed0", publish(store).artefact)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(NotFound) as caught:
+        store.resolve("runs/airl-irm-sede0/reward.pt")
+    assert "did you mean 'airl-irm-seed0'" in caught.value.hint
+
+
 def test_ambiguity_names_the_candidates(empty_store, artefact):
     """A second artefact with the same first digits, as 4096 artefacts are sure to bring."""
     twin = artefact.id[:6] + "0" * 10
