@@ -42,9 +42,9 @@ def test_methods_are_compared_row_by_row():
 
 def test_the_paired_test_uses_the_seeds_that_both_methods_have():
     values = complete()
-    # Seeds 1 and 2 are common; their differences are 2 and 4: t = 3 with one degree of freedom.
-    values[BOUNCE, "erm", "transfer"] = [None, 1.0, 5.0]
-    values[BOUNCE, "irm", "transfer"] = [-100.0, 3.0, 9.0]
+    # Seeds 1 and 2 are common; their differences are 4 and 2: t = 3 with one degree of freedom.
+    values[BOUNCE, "erm", "transfer"] = [None, 5.0, 1.0]
+    values[BOUNCE, "irm", "transfer"] = [-100.0, 9.0, 3.0]
     report = build(*example(values), {}, {})
     first = report.comparisons.iloc[0]
     assert first["pairs"] == 2
