@@ -53,7 +53,7 @@ def build(
     tables = [
         *result_tables.measures(p, cells, comparisons),
         result_tables.learned_returns(learned_returns),
-        result_tables.comparisons(comparisons),
+        result_tables.comparisons(p, comparisons),
         result_tables.discriminators(discriminators),
         result_tables.cells(cells),
         result_tables.budgets(p),

@@ -158,13 +158,12 @@ def learned_returns(found: pd.DataFrame) -> Table:
     return Table("Learned returns", _LEARNED_NOTE, columns, lines, heads=2)
 
 
-def comparisons(found: pd.DataFrame) -> Table:
+def comparisons(p: Parameters, found: pd.DataFrame) -> Table:
     """The pairs of methods that both have a seed."""
+    rows = {row.name: row for row in p.rows}
     lines = []
     for r in found[found["difference"].notna()].itertuples():
-        printed = paper.TABLE1.get(tuple(r.row.split(" ", 1)))
-        if r.measure != "transfer" or (r.x, r.y) != ("irm", "erm"):
-            printed = None
+        printed = paper_row(p, rows[r.row], r.measure) if (r.x, r.y) == ("irm", "erm") else None
         remark = "not imitated: do not interpret the gap" if r.not_imitated else ""
         lines.append(
             [

@@ -7,18 +7,8 @@ how long, at which commit) are parameters, so that equal requests give equal byt
 from collections.abc import Mapping
 from typing import Any
 
-from irlcli.report.parameters import (
-    EXPERT_BY_REWARD,
-    Cell,
-    Code,
-    Others,
-    Parameters,
-    Row,
-    Run,
-)
+from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
 from irlcli.stages.base import Job, Request, Source, Stage
-
-__all__ = ["Cell", "Code", "Others", "Parameters", "Row", "Run", "STAGE", "request"]
 
 
 def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
