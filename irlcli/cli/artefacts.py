@@ -51,8 +51,10 @@ def ls(
 @store_command
 def show(session: Session, ref: Ref) -> None:
     """Show an artefact: its stage, parameters, inputs and outputs."""
+    from irlcli.experiments import provenance
+
     artefact = session.artefact(ref)
-    record = artefact.manifest.record
+    record, origin = artefact.manifest.record, artefact.provenance()
     value = {
         "id": artefact.id,
         "path": str(artefact.directory),
@@ -62,7 +64,8 @@ def show(session: Session, ref: Ref) -> None:
             output.path: {"size": output.size, "sha256": output.sha256}
             for output in artefact.manifest.outputs
         },
-        "provenance": artefact.provenance(),
+        "provenance": origin,
+        "other_versions": provenance.other_versions(origin),
     }
     if session.as_json:
         out.print_json("artefact", value)

@@ -9,7 +9,7 @@ import typer
 
 from irlcli.cli import complete
 from irlcli.cli import console as out
-from irlcli.cli.options import stage_command
+from irlcli.cli.options import planning_command, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.tables import Choice, copy_outputs, open_plan, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from irlcli.experiments.execute import Outcome
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.runner import Runner
+    from irlcli.experiments.status import Step
 
 _TableName = Annotated[
     str, typer.Argument(metavar="TABLE", help="e.g. table1.", autocompletion=complete.tables)
@@ -40,7 +41,7 @@ TableFile = Annotated[
 ]
 
 
-@stage_command
+@planning_command
 def plan(
     session: StageSession,
     table: _TableName,
@@ -65,6 +66,7 @@ def plan(
 def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
     command = _child_words(session, choice, found)
     steps = {name: found.step(name) for name in found.tasks}
+    versions = {name: _other_versions(step) for name, step in steps.items()}
     counts = found.counts()
     if session.as_json:
         document = [
@@ -75,6 +77,7 @@ def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
                 "request": step.label,
                 "why": step.why,
                 "needs": list(found.needs[name]),
+                "other_versions": versions[name],
                 "command": ["irl", *command(name)],
             }
             for name, step in steps.items()
@@ -85,6 +88,22 @@ def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
         out.print_data(f"{step.status:8}{name}: {step.why}")
     parts = [f"{count} {status}" for status, count in counts.items() if count]
     out.print_note(f"{len(steps)} steps: {', '.join(parts)}")
+    older = [text for texts in versions.values() for text in texts]
+    if older:
+        count = sum(bool(texts) for texts in versions.values())
+        session.console.warn(
+            f"{count} of the artefacts were made with other library versions: "
+            f"{', '.join(sorted(set(older)))}"
+        )
+
+
+def _other_versions(step: "Step") -> list[str]:
+    """How the libraries that made an existing artefact differ from those present."""
+    from irlcli.experiments import provenance
+
+    if step.artefact is None:
+        return []
+    return provenance.other_versions(step.artefact.provenance())
 
 
 @stage_command

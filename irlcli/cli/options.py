@@ -105,16 +105,25 @@ def stage_command(function: Callable[..., None]) -> Callable[..., None]:
     return _with_options(function, _stage_session)
 
 
+def planning_command(function: Callable[..., None]) -> Callable[..., None]:
+    """As :func:`stage_command`, for a command that always works as with --dry-run."""
+    return _with_options(function, _stage_session, dry_run=True)
+
+
 def _with_options(
-    function: Callable[..., None], open_session: Callable[..., Session], reads: bool = True
+    function: Callable[..., None],
+    open_session: Callable[..., Session],
+    reads: bool = True,
+    **fixed: object,
 ) -> Callable[..., None]:
-    """``function`` with the parameters of ``open_session`` in place of its session."""
-    common = inspect.signature(open_session).parameters
+    """``function`` with the parameters of ``open_session``, but ``fixed``, for its session."""
+    declared = inspect.signature(open_session).parameters
+    common = {name: p for name, p in declared.items() if name not in fixed}
     own = list(inspect.signature(function).parameters.values())[1:]
 
     @functools.wraps(function)
     def run(**values: object) -> None:
-        session = open_session(**{name: values.pop(name) for name in common})
+        session = open_session(**fixed, **{name: values.pop(name) for name in common})
         with session.reading() if reads else nullcontext():
             function(session, **values)
 

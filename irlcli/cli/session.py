@@ -26,9 +26,10 @@ class Session:
         as_json: bool = False,
         console: out.TerminalConsole | None = None,
         wait: bool = True,
+        read_only: bool = False,
     ):
         self.console = console or out.TerminalConsole()
-        self.store = Store(store, self.console.warn)
+        self.store = Store(store, self.console.warn, read_only)
         self.as_json = as_json
         self.wait = wait
 
@@ -88,7 +89,9 @@ class StageSession(Session):
         from irlcli.configs import check_profile
 
         check_profile(profile)
-        super().__init__(store, as_json, out.TerminalConsole(quiet, tensorboard), wait)
+        super().__init__(
+            store, as_json, out.TerminalConsole(quiet, tensorboard), wait, read_only=dry_run
+        )
         self.profile = profile
         self.file = file
         # Settings file of a table, which --settings replaces.

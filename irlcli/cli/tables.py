@@ -113,6 +113,7 @@ def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> 
 
 def print_report(session: StageSession, artefact: Artefact, kind: str) -> None:
     """The tables and caveats of a report on stderr."""
+    _warn_of_versions(session, artefact)
     report = report_json(session, artefact, kind)
     if report is None:
         out.print_note(session.store.open(artefact, f"{kind}.md").read_text().rstrip())
@@ -123,6 +124,21 @@ def print_report(session: StageSession, artefact: Artefact, kind: str) -> None:
             out.print_note(f"{table['note']}\n" if table["note"] else "")
     for caveat in report["caveats"]:
         out.print_note(f"- {caveat}")
+
+
+def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:
+    """Warn of artefacts in a report that were made with other library versions than those present."""
+    from irlcli.experiments.provenance import other_versions
+
+    parameters = artefact.manifest.record.parameters
+    names = [made["libraries"] for made in parameters.get("runs", {}).values()]
+    for name, versions in parameters.get("libraries", {}).items():
+        others = other_versions({"libraries": versions})
+        if others:
+            session.console.warn(
+                f"{names.count(name)} artefacts of this report were made with other library "
+                f"versions: {', '.join(others)}"
+            )
 
 
 def report_json(session: StageSession, artefact: Artefact, kind: str) -> Any | None:

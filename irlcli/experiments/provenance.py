@@ -1,5 +1,7 @@
-"""Where a result came from: attempts, code, libraries; and the header of a checkpoint, which
-carries the attempts from one process to the next."""
+"""Where a result came from: attempts, code, libraries.
+
+The header of a checkpoint carries the attempts from one process to the next.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import functools
 import hashlib
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +31,9 @@ _LIBRARIES = (
 
 
 class Attempt(msgspec.Struct, frozen=True, kw_only=True):
-    """One process's part in a result: when it began [UTC], how long it worked [s], by which code.
+    """One process's part in a result: when it started [UTC], how long it ran [s], and its code.
 
-    ``dirty`` is a digest of what was not committed; None if nothing, or if there is no git.
+    ``dirty`` is a digest of uncommitted changes; None if there are none, or without git.
     """
 
     started: str
@@ -40,7 +43,7 @@ class Attempt(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
-    """What a checkpoint says of itself."""
+    """What a checkpoint records about itself."""
 
     schema: int
     stage: str
@@ -55,32 +58,48 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decode(data: bytes, stage: str, stage_version: int) -> tuple[Header, bytes]:
-    """The header and the state of a checkpoint, if this program can go on from it.
+    """The header and the state of a checkpoint that this program can resume.
 
     Raises:
-        ValueError: of another schema, stage, version or libraries; or no checkpoint at all.
+        ValueError: another schema, stage, version or libraries; or not a checkpoint.
     """
     end = 4 + int.from_bytes(data[:4], "big")
     try:
         schema = msgspec.json.decode(data[4:end], type=_Schema).schema
         header = msgspec.json.decode(data[4:end], type=Header) if schema == SCHEMA else None
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise ValueError("its header is not readable") from None
     if header is None:
-        raise ValueError(f"it has schema {schema}, {SCHEMA} is the one known here")
+        raise ValueError(f"it has schema {schema}, the one known here is {SCHEMA}")
     if (header.stage, header.stage_version) != (stage, stage_version):
         raise ValueError(
-            f"{header.stage} {header.stage_version} wrote it, this is {stage} {stage_version}"
+            f"{header.stage[:40]} {header.stage_version} wrote it, this is {stage} {stage_version}"
         )
-    present = libraries()
-    differing = [
-        f"{name} {header.libraries.get(name)} (now {present.get(name)})"
-        for name in sorted({*present, *header.libraries})
-        if header.libraries.get(name) != present.get(name)
-    ]
-    if differing:
-        raise ValueError(f"it was written with {', '.join(differing)}")
+    others = differing(header.libraries)
+    if others:
+        shown = ", ".join(text[:80] for text in others[:3])
+        raise ValueError(f"it was written with {shown}")
     return header, data[end:]
+
+
+def differing(recorded: Mapping[str, str | None]) -> list[str]:
+    """The libraries whose version differs from the one present, as ``torch 2.6.0 (now 2.13.0)``."""
+    present = libraries()
+    return [
+        f"{name} {recorded.get(name)} (now {present.get(name)})"
+        for name in sorted({*present, *recorded})
+        if recorded.get(name) != present.get(name)
+    ]
+
+
+def other_versions(origin: Mapping[str, Any]) -> list[str]:
+    """:func:`differing`, for the provenance record of a result.
+
+    The version of irlcli is left out: a change of its code that alters results raises the stage's
+    version, and with it the key.
+    """
+    recorded = dict(origin.get("libraries") or {})
+    return differing({**recorded, "irlcli": libraries()["irlcli"]})
 
 
 class _Schema(msgspec.Struct):
@@ -92,7 +111,7 @@ class Clock:
 
     def __init__(self):
         self._started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        # Not the time of day, which may be set back.
+        # The time of day may be set back.
         self._begin = time.monotonic()
         self._git = git_state(Path(__file__).parent)
 
@@ -104,8 +123,8 @@ class Clock:
 
 @functools.cache
 def libraries() -> dict[str, str | None]:
-    """Versions of what a result is computed with; None for a library that is not installed."""
-    # Imported here and below: a hit does without, and they take longer than it does.
+    """Versions of what results are computed with; None for a library that is not installed."""
+    # Imported here and below: a hit does not need them, and importing takes longer than a hit.
     import platform
 
     found = {name: _version(name) for name in ("irlcli", *_LIBRARIES)}
@@ -113,7 +132,7 @@ def libraries() -> dict[str, str | None]:
 
 
 def record(command: list[str], workers: int, attempts: tuple[Attempt, ...]) -> dict[str, Any]:
-    """The provenance of a result that ``attempts`` led to, the last of them just now."""
+    """The provenance of a result of ``attempts``, the last of which is the present one."""
     import platform
 
     last = attempts[-1]
@@ -141,9 +160,9 @@ def _version(library: str) -> str | None:
 
 
 def git_state(package: Path) -> dict[str, str | None]:
-    """Commit of the checkout that ``package`` lies in, and a digest of what is not committed.
+    """Commit of the checkout that holds ``package``, and a digest of uncommitted changes.
 
-    Changes and new files inside the package count, ignored files do not.
+    The digest covers changes and new files inside the package, but no ignored files.
     """
     import shutil
     import subprocess

@@ -11,11 +11,10 @@ import pytest
 from test_architecture import loaded_by
 
 from irlcli.configs import load_config
-from irlcli.experiments.tables import load_tables
 from irlcli.store import Store
 from irlcli.store.manifest import encode_provenance
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 SMALL = ["--set", "airl.total_steps=2048", "--set", "transfer.total_steps=1024"]
 SMALL += ["--set", "evaluation.episodes=2", "--set", "expert.total_steps=1024"]
 ROW = ["--env", "lunar-lander"]
@@ -66,7 +65,7 @@ def report(irl):
     return run
 
 
-def notes(result):
+def caveats(result):
     return [line[2:] for line in result.err.splitlines() if line.startswith("- ")]
 
 
@@ -105,11 +104,11 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
     assert cells.loc[("lunar-lander bounce", "erm", "transfer"), "seeds"] == 0
 
 
-def test_what_the_rewards_pay_is_that_of_the_evaluations(report, table_store):
+def test_learned_returns_are_those_of_the_evaluations(report, table_store):
     directory = Path(report("table1", table_store, *ROW).out.strip())
     store = Store(table_store)
-    paid = json.loads((directory / "table1.json").read_text())["paid"]
-    assert [(r["row"], r["agent"], r["seeds"]) for r in paid] == [
+    scored = json.loads((directory / "table1.json").read_text())["learned_returns"]
+    assert [(r["row"], r["agent"], r["seeds"]) for r in scored] == [
         ("lunar-lander engine-power", "erm", 2),
         ("lunar-lander engine-power", "irm", 1),
     ]
@@ -122,8 +121,8 @@ def test_what_the_rewards_pay_is_that_of_the_evaluations(report, table_store):
     policies, experts = (
         [mean(f"erm.{seed}.{x}") for seed in "01"] for x in ("transfer-returns", "expert")
     )
-    assert paid[0]["policy"] == pytest.approx(sum(policies) / 2)
-    assert paid[0]["expert"] == pytest.approx(sum(experts) / 2)
+    assert scored[0]["retrained"] == pytest.approx(sum(policies) / 2)
+    assert scored[0]["expert"] == pytest.approx(sum(experts) / 2)
     points = pd.read_csv(directory / "seeds.csv")
     by_reward = points[points["measure"] == "expert by reward"]
     assert set(by_reward["expert_of"]) == {"engine-power=1.5x"}
@@ -133,20 +132,20 @@ def test_what_the_rewards_pay_is_that_of_the_evaluations(report, table_store):
     # The experts' true return is no sample of any method's.
     assert not any(
         "the same returns to the bit" in n and "by reward" in n
-        for n in notes(report("table1", table_store, *ROW))
+        for n in caveats(report("table1", table_store, *ROW))
     )
 
 
-def test_experts_are_carried_over_to_every_setting(report, irl, table_store):
+def test_experts_are_evaluated_in_the_other_settings_too(report, irl, table_store):
     directory = Path(report("table1", table_store, *ROW).out.strip())
     points = pd.read_csv(directory / "seeds.csv")
     points = points[points["row"] == "lunar-lander engine-power"]
-    carried = points[points["agent"] == "reused"]
+    reused = points[points["agent"] == "reused"]
     trained = ["engine-power=1.25x", "engine-power=1x"]
-    unseen = carried[carried["measure"] == "ood"]
+    unseen = reused[reused["measure"] == "ood"]
     assert sorted(unseen["expert_of"]) == trained
     assert set(unseen["setting"]) == {"engine-power=1.5x"}
-    inside = carried[carried["measure"] == "id"].set_index(["expert_of", "setting"])["true_return"]
+    inside = reused[reused["measure"] == "id"].set_index(["expert_of", "setting"])["true_return"]
     assert sorted(inside.index) == [(own, place) for own in trained for place in trained]
     experts = points[(points["agent"] == "expert") & (points["measure"] == "id")]
     for own, place, value in zip(
@@ -170,10 +169,10 @@ def test_a_transfer_evaluated_without_its_reward_counts_too(report, irl, table_s
     shutil.copytree(table_store, copy, symlinks=True)
     store = Store(copy)
     common = ["--store", copy, "--profile", "smoke", *SMALL]
-    paid = store.resolve("erm.0.transfer-returns").artefact
+    scored = store.resolve("erm.0.transfer-returns").artefact
     assert irl("evaluate", "--policy", "erm.0.transfer", *common).code == 0
     with_reward = Path(report("table1", copy, *ROW).out.strip())
-    shutil.rmtree(paid.directory)
+    shutil.rmtree(scored.directory)
     without = Path(report("table1", copy, *ROW).out.strip())
     tables = [json.loads((d / "table1.json").read_text()) for d in (with_reward, without)]
     cells = [
@@ -185,12 +184,15 @@ def test_a_transfer_evaluated_without_its_reward_counts_too(report, irl, table_s
         for t in tables
     ]
     assert cells[0]["mean"] == cells[1]["mean"] and cells[1]["seeds"] == 2
-    assert [[r["seeds"] for r in t["paid"] if r["agent"] == "erm"] for t in tables] == [[2], [1]]
+    assert [[r["seeds"] for r in t["learned_returns"] if r["agent"] == "erm"] for t in tables] == [
+        [2],
+        [1],
+    ]
 
 
 def test_what_is_missing_is_said(report, table_store):
     done = report("table1", table_store, *ROW)
-    said = notes(done)
+    said = caveats(done)
     assert any(n.startswith("Missing: lunar-lander bounce: 0 of ") for n in said)
     (mine,) = (n for n in said if n.startswith("Missing: lunar-lander engine-power"))
     assert "transfer has not run: AIRL-IRM 1." in mine
@@ -227,7 +229,7 @@ def test_json_holds_the_tables(report, table_store):
     done = report("table1", table_store, *ROW, "--json")
     value = json.loads(done.out)
     assert value["kind"] == "artefact" and "table1.html" in value["outputs"]
-    assert value["report"]["notes"] == notes(report("table1", table_store, *ROW))
+    assert value["report"]["caveats"] == caveats(report("table1", table_store, *ROW))
     agents = {(c["agent"], c["measure"]) for c in value["report"]["cells"]}
     assert {("erm", "transfer"), ("expert", "id"), ("random", "ood")} <= agents
 
@@ -238,7 +240,7 @@ def test_nothing_is_run(report, table_store):
     assert planned.out.startswith("RUN     report table1")
     assert set(Store(table_store).ids()) == before
     partly = report("table1", table_store, *ROW, seeds="0,1,2")
-    assert any("train-airl has not run: AIRL-ERM 2; AIRL-IRM 2" in n for n in notes(partly))
+    assert any("train-airl has not run: AIRL-ERM 2; AIRL-IRM 2" in n for n in caveats(partly))
     made = set(Store(table_store).ids()) - before
     assert {Store(table_store).get(i).manifest.record.stage for i in made} == {"report"}
 
@@ -260,7 +262,7 @@ def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path
     made = irl("train-airl", "--demos", "demos", "--method", "irm", "--seed", "0", *more)
     assert made.code == 0, made.err
     done = report("table1", copy, *ROW)
-    (left_out,) = (n for n in notes(done) if n.startswith("Left out"))
+    (left_out,) = (n for n in caveats(done) if n.startswith("Left out"))
     assert "1 run of train-airl, lunar-lander engine-power=1x engine-power=1.25x irm" in left_out
     assert f"({Path(made.out.strip()).name})" in left_out
     assert left_out.endswith("airl.total_steps 1024 instead of 2048.")
@@ -273,7 +275,7 @@ def test_other_evaluations_are_left_out_too(report, irl, table_store, tmp_path):
     shutil.copytree(table_store, copy, symlinks=True)
     more = ["--store", copy, "--profile", "smoke", "--quiet", *SMALL, "--episodes", "3"]
     assert irl("evaluate", "--policy", "irm.0", "--ood", "1.5x", *more).code == 0
-    (left_out,) = (n for n in notes(report("table1", copy, *ROW)) if n.startswith("Left out"))
+    (left_out,) = (n for n in caveats(report("table1", copy, *ROW)) if n.startswith("Left out"))
     assert left_out.endswith("evaluation.episodes 3 instead of 2.")
 
 
@@ -290,7 +292,7 @@ def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path
     said = json.loads(done.out)["report"]
     there = {(p["agent"], p["seed"]) for p in said["points"] if p["measure"] == "zero-shot"}
     assert there == {("erm", 0), ("erm", 1), ("irm", 0)}
-    (missing,) = (n for n in said["notes"] if n.startswith("Missing: lunar-lander engine-power"))
+    (missing,) = (n for n in said["caveats"] if n.startswith("Missing: lunar-lander engine-power"))
     assert "AIRL-IRM 1" in missing
     (budgets,) = (t for t in said["tables"] if t["title"] == "Budgets")
     weight = json.loads((copy / made.out.strip().split("/")[-1] / "reward.json").read_text())
@@ -303,7 +305,7 @@ def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path
 def test_a_profile_without_runs_is_no_table(report, irl, table_store):
     done = report("table1", table_store, small=[])
     assert done.code == 3
-    assert "holds no evaluation of table1" in done.err and "make table1" in done.err
+    assert "holds no evaluation of table1" in done.err and "irl run table1" in done.err
     assert report("figure3", table_store).code == 3
     nowhere = irl("report", "table1", "--store", table_store.parent / "new")
     assert nowhere.code == 3
@@ -313,17 +315,18 @@ def test_a_profile_without_runs_is_no_table(report, irl, table_store):
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["table3"], "unknown report 'table3'", "table1, figure2"),
-        (["table1", "--methods", "erm,irn"], "unknown method 'irn'", "erm-balanced"),
-        (["table1", "--methods", "erm,erm"], "method erm is named twice", "once"),
-        (["table1", "--seeds", "0,0"], "seed 0 is named twice", "once"),
-        (["table1", "--seeds", "0-4"], "--seeds '0-4' is no list of seeds", "0,1,2,3,4"),
-        (["table1", "--seeds", "-1"], "no seed -1 or below", "0 or more"),
+        (["table3"], "unknown report 'table3'", "returns, table1, table2"),
+        (["table1", "--methods", "erm,irn"], "--methods: unknown 'irn'", "did you mean 'irm'"),
+        (["table1", "--methods", "erm,erm"], "--methods: erm appears twice", "once"),
+        (["table1", "--seeds", "0,0"], "--seeds: 0 appears twice", "once"),
+        (["table1", "--seeds", "0-4"], "--seeds '0-4' is not a list of seeds", "0,1,2,3,4"),
+        (["table1", "--seeds", "-1"], "holds a negative seed", "0 or more"),
         (["table1", "--env", "reacher"], "table1 has no row of 'reacher'", "ant, lunar-lander"),
-        (["table1", "demos"], "table1 takes no references", "found by their settings"),
-        (["figure2", "--seeds", "1"], "figure2 takes no --seeds", "--help"),
+        (["table1", "demos"], "table1 takes no references", "found by their configuration"),
+        (["figure2", "--seeds", "1"], "figure2 takes no --seeds", "omit --seeds"),
+        (["experts", "--methods", "erm"], "experts takes no --methods", "omit --methods"),
         (["table2", "--format", "pdf"], "unknown --format 'pdf'", "markdown"),
-        (["table1", "--format", "latex"], "table1 takes no --format", "--help"),
+        (["table1", "--format", "latex"], "table1 takes no --format", "omit --format"),
     ],
 )
 def test_bad_requests_are_refused(irl, table_store, arguments, message, hint):
@@ -348,13 +351,6 @@ def test_table2_needs_no_store_and_prints_the_settings(irl, tmp_path):
     assert r"ant & leg-length & 1x, 2x & 3x \\" in latex
     assert len(text.splitlines()) == 1 + len(rows) == len(markdown.splitlines()) - 1
     assert not (tmp_path / "none").exists()
-
-
-def test_makefile_has_the_rows_of_the_reports():
-    text = (ROOT / "Makefile").read_text()
-    for kind, experiment in EXPERIMENTS.items():
-        (rows,) = re.findall(rf"^{kind.upper()}\s*:= (.*)$", text, re.MULTILINE)
-        assert [tuple(row.split(".")) for row in rows.split()] == list(experiment.rows)
 
 
 def test_goal_demonstrations_favour_the_right(irl, tmp_path):
@@ -395,7 +391,7 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
     assert (row["steps"], row["episodes"], row["stands"]) == (1024, 2, "done")
     assert found.loc["bounce=0.9", "stands"] == "train-expert has not run"
     assert pd.isna(found.loc["bounce=0.9", "true_return"])
-    (missing,) = notes(done)
+    (missing,) = caveats(done)
     assert missing.startswith("Missing: 6 of 9 experts: lunar-lander bounce=0.1")
     assert (
         "| lunar-lander bounce=0.9 | held out | train-expert has not run |"
@@ -404,13 +400,13 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
     again = irl("report", "experts", *ROW, *common)
     assert again.out == done.out and "HIT" in again.err
     barred = irl("report", "experts", *ROW, *common, "--set", "expert.bar=1000")
-    (low, _) = notes(barred)
+    (low, _) = caveats(barred)
     assert low.startswith("Below their bar") and "engine-power=1.5x" in low
 
 
 def test_no_experts(irl, tmp_path):
     empty = irl("report", "experts", *ROW, "--store", tmp_path / "runs")
-    assert empty.code == 3 and "make experts" in empty.err
+    assert empty.code == 3 and "irl run experts" in empty.err
     tabular = irl("report", "experts", "--env", "gridworld", "--store", tmp_path / "runs")
     assert tabular.code == 2 and "gridworld" in tabular.err
     refused = irl("report", "experts", "--seeds", "0", "--store", tmp_path / "runs")
@@ -453,8 +449,8 @@ def test_a_run_that_went_on_elsewhere_is_mixed(report, table_store, tmp_path):
     artefact.directory.chmod(0o755)
     path.chmod(0o644)
     path.write_bytes(encode_provenance(artefact.manifest.id, said))
-    assert not any(n.startswith("Mixed") for n in notes(report("table1", table_store, *ROW)))
-    (mixed,) = (n for n in notes(report("table1", store, *ROW)) if n.startswith("Mixed"))
+    assert not any(n.startswith("Mixed") for n in caveats(report("table1", table_store, *ROW)))
+    (mixed,) = (n for n in caveats(report("table1", store, *ROW)) if n.startswith("Mixed"))
     assert re.search(r"0000000000[^,;]* then ", mixed)
 
 
@@ -471,31 +467,32 @@ def test_what_a_report_does_not_take_is_refused(irl, table_store):
         assert "error:" in refused.err
 
 
-def test_make_does_not_take_other_runs_for_the_plain_ones():
-    def targets(*words):
-        line = ["make", "-n", "-C", str(ROOT), "-o", ".venv/.installed", "report-table1", *words]
-        return subprocess.run(line, capture_output=True, text=True)
+def test_make_passes_its_variables_on():
+    def commands(*words):
+        line = ["make", "-n", "-C", str(ROOT), "-o", ".venv/.installed", *words]
+        done = subprocess.run(line, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return [text for text in done.stdout.splitlines() if "/irl " in text]
 
-    plain = targets().stdout
-    assert "results/standard/table1" in plain and "docs/" not in plain
-    assert (
-        "--store runs " in plain and "--store elsewhere " in targets("IRL_STORE=elsewhere").stdout
+    plain = commands("table1")
+    until = ["--until experts", "--until rewards", "--until transfers", "--until returns"]
+    assert [line.split("--jobs 2 ")[1].strip() for line in plain] == [
+        *until,
+        "--out results/standard/table1",
+    ]
+    assert all(" run table1 --store runs --profile standard " in line for line in plain)
+    assert len(commands("figure4.rewards")) == 2
+    assert "--store elsewhere " in commands("demo", "IRL_STORE=elsewhere")[0]
+    assert "--store here " in commands("demo", "IRL_STORE=elsewhere", "STORE=here")[0]
+    assert "--from settings " in commands("demo", "FROM=settings")[0]
+    assert "--from" not in commands("demo", "FROM=no-such-directory")[0]
+    chosen = commands(
+        "figure3", "SEEDS=0 1", "METHODS=erm irm", "ENVIRONMENT=ant", "TAG=x", "JOBS=4"
+    )[-1]
+    for words in ('--seeds "0 1"', '--methods "erm irm"', "--env ant", "--tag x", "--jobs 4"):
+        assert f" {words} " in chosen
+    assert chosen.endswith("--out results/x/figure3-ant")
+    assert commands("experts", "RESULTS=docs/results/experts")[0].endswith(
+        "--out docs/results/experts"
     )
-    assert "--store here " in targets("IRL_STORE=elsewhere", "STORE=here").stdout
-    smoke = targets("PROFILE=smoke").stdout
-    assert "results/smoke/table1" in smoke and "docs/" not in smoke
-    for word in ("SEEDS=0,1", "SEEDS=0'1", "SEEDS=", "SEEDS=0 0", "METHODS=imr", "METHODS="):
-        refused = targets(word)
-        assert refused.returncode != 0 and "with spaces between them" in refused.stderr
-    for word, said in (
-        ("SEEDS=0 01", "without zeros"),
-        ("TAG=a b", "one word"),
-        ("TAG=", "one word"),
-    ):
-        refused = targets(word)
-        assert refused.returncode != 0 and said in refused.stderr
-    for word in ("SET=--set airl.penalty_weight=3", "CHOOSE=--choose-penalty 1,10"):
-        refused = targets(word)
-        assert refused.returncode != 0 and "TAG=mine" in refused.stderr
-        named = targets(word, "TAG=three").stdout
-        assert "results/three/table1" in named and "--name three.table1" in named
+    assert commands("report-table1")[0].endswith("--name standard.table1")

@@ -1,0 +1,177 @@
+"""``irl plan``: names, statuses and reasons; nothing is written."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from irlcli.store import Store
+
+TABLES = """
+[tiny]
+title = "Engine power"
+rows = ["lunar-lander.engine-power"]
+methods = ["irm"]
+seeds = [0]
+measures = ["transfer"]
+"""
+ROW = "smoke.lunar-lander.engine-power"
+
+
+@pytest.fixture
+def tables(tmp_path):
+    path = tmp_path / "tables.toml"
+    path.write_text(TABLES)
+    return path
+
+
+@pytest.fixture
+def plan(irl, tables):
+    """``plan(store, ...)``: the steps of the tiny table as JSON, by name."""
+
+    def run(store, *more):
+        words = ["plan", "tiny", "--experiments", tables, "--profile", "smoke", "--store", store]
+        done = irl(*words, *more, "--json")
+        assert done.code == 0, done.err
+        document = json.loads(done.out)
+        assert document["kind"] == "plan" and document["version"] == 1
+        assert sum(document["counts"].values()) == len(document["steps"])
+        return {step["name"]: step for step in document["steps"]}
+
+    return run
+
+
+def tree(root):
+    """Every path below ``root`` with its size and times."""
+    return {
+        path: (status.st_size, status.st_mtime_ns, status.st_mode)
+        for path in sorted(root.rglob("*"))
+        if (status := path.lstat())
+    }
+
+
+def test_an_empty_store_needs_everything_and_stays_absent(plan, irl, tables, tmp_path):
+    store = tmp_path / "none"
+    steps = plan(store)
+    assert {name.removeprefix(f"{ROW}.") for name in steps} == {
+        *("expert.1x", "expert.1.25x", "expert.1.5x", "demos", "irm.0", "irm.0.transfer"),
+        *("random-returns", "idle-returns", "expert-returns"),
+        *("expert.1x.reused-returns", "expert.1.25x.reused-returns"),
+        *("irm.0.transfer-returns", "irm.0.expert-by-reward"),
+    }
+    ready = {name for name, step in steps.items() if step["status"] == "RUN"}
+    assert {name.removeprefix(f"{ROW}.") for name in ready} == {
+        *("expert.1x", "expert.1.25x", "expert.1.5x", "random-returns", "idle-returns"),
+    }
+    assert all(steps[name]["key"] for name in ready)
+    demos = steps[f"{ROW}.demos"]
+    assert (demos["status"], demos["key"]) == ("BLOCKED", None)
+    assert demos["needs"] == [f"{ROW}.expert.1x", f"{ROW}.expert.1.25x"]
+    assert demos["why"] == f"waits for {ROW}.expert.1x, {ROW}.expert.1.25x"
+    scored = steps[f"{ROW}.irm.0.transfer-returns"]
+    assert scored["needs"] == [f"{ROW}.irm.0.transfer", f"{ROW}.irm.0"]
+    text = irl("plan", "tiny", "--experiments", tables, "--profile", "smoke", "--store", store)
+    assert f"BLOCKED {ROW}.demos: waits for " in text.out
+    assert "13 steps: 5 RUN, 8 BLOCKED" in text.err
+    assert not store.exists()
+
+
+def test_every_step_stands_after_what_it_needs(irl, tmp_path):
+    for table in ("table1", "figure2", "experts"):
+        done = irl("plan", table, "--json", "--store", tmp_path / "none")
+        steps = json.loads(done.out)["steps"]
+        seen = set()
+        for step in steps:
+            assert seen.issuperset(step["needs"]), step["name"]
+            seen.add(step["name"])
+        assert len(seen) == len(steps)
+
+
+def test_phases_end_a_plan(plan, tmp_path):
+    phases = ("experts", "demos", "rewards", "transfers", "returns")
+    sizes = [len(plan(tmp_path / "none", "--until", phase)) for phase in phases]
+    assert sizes == [3, 4, 5, 6, 13]
+
+
+def test_lambda_is_chosen_by_a_step_for_every_candidate_and_setting(plan, tmp_path):
+    steps = plan(tmp_path / "none", "--choose-penalty", "1,10", "--until", "rewards")
+    trials = {name.removeprefix(f"{ROW}.irm.0.choice") for name in steps if ".choice" in name}
+    left_out = {f".{weight}.without-{value}" for weight in (1, 10) for value in ("1x", "1.25x")}
+    assert trials == {""} | left_out | {f"{trial}.returns" for trial in left_out}
+    assert f"{ROW}.irm.0.choice" in steps[f"{ROW}.irm.0"]["needs"]
+
+
+def test_what_exists_is_a_hit_whoever_made_it(plan, smoke_store):
+    """The chain of plain commands gives the artefacts that the table asks for."""
+    steps = plan(smoke_store.path)
+    found = {name: step["why"] for name, step in steps.items() if step["status"] == "HIT"}
+    assert {
+        name.removeprefix(f"{ROW}."): why.rpartition("/")[2] for name, why in found.items()
+    } == {
+        "expert.1x": smoke_store.expert,
+        "expert.1.25x": found[f"{ROW}.expert.1.25x"].rpartition("/")[2],
+        "demos": smoke_store.demos,
+        "irm.0": smoke_store.airl,
+        "irm.0.transfer": smoke_store.transfer,
+    }
+    waiting = steps[f"{ROW}.expert-returns"]
+    assert (waiting["status"], waiting["why"]) == ("BLOCKED", f"waits for {ROW}.expert.1.5x")
+    assert steps[f"{ROW}.irm.0.transfer-returns"]["status"] == "RUN"
+
+
+def test_what_another_store_holds_is_found_there(plan, smoke_store, tmp_path):
+    before = tree(smoke_store.path)
+    steps = plan(tmp_path / "none", "--from", smoke_store.path)
+    demos = steps[f"{ROW}.demos"]
+    assert (demos["status"], demos["why"]) == ("FOUND", f"in {smoke_store.path}")
+    assert sum(step["status"] == "FOUND" for step in steps.values()) == 5
+    assert tree(smoke_store.path) == before and not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("read_only", [True, False])
+def test_planning_writes_nothing_even_where_an_artefact_is_damaged(plan, store_copy, read_only):
+    directory = store_copy.path / store_copy.demos
+    for path in (directory, directory / "summary.json"):
+        path.chmod(0o755)
+    (directory / "summary.json").write_text("{}")
+    paths = [store_copy.path, *store_copy.path.rglob("*")]
+    modes = {path: path.stat().st_mode for path in paths}
+    for path in paths if read_only else []:
+        path.chmod(modes[path] & ~0o222)
+    before = tree(store_copy.path)
+    try:
+        steps = plan(store_copy.path)
+        assert tree(store_copy.path) == before
+    finally:
+        for path in paths:
+            path.chmod(modes[path])
+    demos = steps[f"{ROW}.demos"]
+    assert demos["status"] == "RUN" and "summary.json" in demos["why"]
+    assert "computed again" in demos["why"]
+    assert steps[f"{ROW}.irm.0"]["status"] == "BLOCKED"
+
+
+def test_other_library_versions_are_named(plan, smoke_store, monkeypatch):
+    from irlcli.experiments import provenance
+
+    assert plan(smoke_store.path)[f"{ROW}.demos"]["other_versions"] == []
+    present = provenance.libraries()
+    monkeypatch.setattr(provenance, "libraries", lambda: {**present, "torch": "99.0"})
+    found = plan(smoke_store.path)[f"{ROW}.demos"]["other_versions"]
+    assert found == [f"torch {present['torch']} (now 99.0)"]
+
+
+def test_the_command_of_a_step_makes_it(plan, irl, tmp_path):
+    """The command line that provenance records, and that a damaged artefact prints, is complete."""
+    store = tmp_path / "runs"
+    name = f"{ROW}.idle-returns"
+    command = plan(store)[name]["command"]
+    made = irl(*command[1:], "--quiet")
+    assert made.code == 0, made.err
+    artefact = Store(store).resolve(name).artefact
+    assert made.out.split() == [str(artefact.directory)]
+    assert len(Store(store).ids()) == 1
+    recorded = artefact.provenance()["command"]
+    assert recorded[: len(command)] == command
+    assert plan(store)[name]["status"] == "HIT"

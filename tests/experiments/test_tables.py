@@ -1,0 +1,131 @@
+"""``settings/experiments.toml``: what it holds, and what is refused in it."""
+
+from __future__ import annotations
+
+import pytest
+
+from irlcli.configs import load_config
+from irlcli.errors import UsageError
+from irlcli.experiments.tables import load_table, load_tables
+from irlcli.methods import METHODS
+
+SOUND = """
+[defaults]
+methods = ["erm", "irm"]
+seeds = [0, 1]
+[mine]
+title = "Mine"
+rows = ["ant.leg-length", "lunar-lander.bounce"]
+measures = ["transfer"]
+"""
+
+
+@pytest.fixture
+def tables(tmp_path):
+    """The tables of a file with the given text."""
+
+    def load(text):
+        path = tmp_path / "experiments.toml"
+        path.write_text(text)
+        return load_tables(path)
+
+    return load
+
+
+def test_the_shipped_tables_are_the_papers():
+    tables = load_tables()
+    assert set(tables) == {"table1", "figure2", "figure3", "figure4", "demo", "experts"}
+    rows = {name: [str(row) for row in table.rows] for name, table in tables.items()}
+    assert rows["table1"] == [
+        "lunar-lander.bounce",
+        "lunar-lander.engine-power",
+        "ant.friction",
+        "ant.leg-length",
+    ]
+    assert rows["figure3"] == ["ant.leg-length", "half-cheetah.friction", "reacher.gravity"]
+    assert rows["figure4"] == ["ant.goal-y", "half-cheetah.goal-y"]
+    for name in ("table1", "figure3", "figure4"):
+        assert tables[name].methods == tuple(METHODS)
+        assert tables[name].seeds == (0, 1, 2, 3, 4)
+    assert tables["table1"].measures == ("transfer", "zero-shot", "id")
+    assert (tables["demo"].methods, tables["demo"].seeds) == (("erm", "irm"), (0,))
+    assert tables["demo"].settings.name == "lunar-lander.toml"
+
+
+def test_experts_has_a_row_for_every_intervention_of_the_settings():
+    rows = {str(row) for row in load_table("experts").rows}
+    for env in ("ant", "half-cheetah", "lunar-lander", "reacher"):
+        listed = load_config(env).interventions
+        assert {row for row in rows if row.startswith(f"{env}.")} == {f"{env}.{k}" for k in listed}
+    assert not any(row.startswith("gridworld") for row in rows)
+
+
+def test_a_table_overrides_the_defaults(tables):
+    mine = tables(SOUND)["mine"]
+    assert (mine.methods, mine.seeds, mine.title) == (("erm", "irm"), (0, 1), "Mine")
+    other = tables(SOUND + 'methods = ["irm"]\nseeds = [7]\n')["mine"]
+    assert (other.methods, other.seeds) == (("irm",), (7,))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message", "hint"),
+    [
+        ("ant.leg-length", "ant.leg-lenght", "mine.rows: ant has no intervention", "'leg-length'"),
+        ("ant.leg-length", "antt.leg-length", "mine.rows: 'antt.leg-length'", "'ant.leg-length'"),
+        ("ant.leg-length", "gridworld.blocked", "mine.rows: 'gridworld.blocked'", "ENVIRONMENT."),
+        ("ant.leg-length", "ant", "mine.rows: ant has no intervention ''", "known: "),
+        ("ant.leg-length", "lunar-lander.bounce", "lunar-lander.bounce appears twice", "once"),
+        ('"irm"', '"imr"', "mine.methods: unknown 'imr'", "did you mean 'irm'"),
+        ('"transfer"', '"tranfer"', "mine.measures: unknown 'tranfer'", "did you mean 'transfer'"),
+        ('["transfer"]', "[]", "mine.measures: the list is empty", "at least one"),
+        ('["transfer"]', '"transfer"', "mine.measures: 'transfer' is not a list", "["),
+        ("measures", "meassures", "mine has no field 'meassures'", "did you mean 'measures'"),
+        ('measures = ["transfer"]', "", "mine.measures is missing", "fields: "),
+        ("[0, 1]", "[0, 0]", "mine.seeds: 0 appears twice", "once"),
+        ("[0, 1]", "[-1]", "mine.seeds: -1 is not a seed", "from 0"),
+        ("[0, 1]", "[true]", "mine.seeds: True is not a seed", "from 0"),
+        ("seeds", "seed", "defaults has no field 'seed'", "did you mean 'seeds'"),
+        ("[mine]", "[Mine]", "'Mine' cannot be the name of a table", "lowercase"),
+        ('"Mine"', "3", "mine.title: 3 is not text", "quotes"),
+        ('"Mine"', '"Mine"\nkind = "expert"', "mine.kind: unknown 'expert'", "'experts'"),
+        ('"Mine"', '"Mine"\nkind = "experts"', "mine.rows: kind 'experts' has no rows", "omit"),
+        ('"Mine"', '"Mine"\nsettings = "none.toml"', "none.toml is not a file", "relative"),
+        ("[mine]", "mine", "is not valid TOML", "example"),
+        ("[defaults]", "mine = 3\n[defaults]", "is not valid TOML", "example"),
+    ],
+)
+def test_a_mistake_is_named_with_its_file_and_field(tables, tmp_path, old, new, message, hint):
+    assert old in SOUND
+    with pytest.raises(UsageError) as caught:
+        tables(SOUND.replace(old, new, 1))
+    assert str(tmp_path / "experiments.toml") in caught.value.message
+    assert message in caught.value.message and "\n" not in caught.value.message
+    assert hint in caught.value.hint
+
+
+def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
+    def refused(*words):
+        done = irl(*words, "--store", tmp_path / "runs")
+        assert done.code == 2 and not done.out
+        error, hint = done.err.splitlines()
+        assert error.startswith("error: ") and hint.startswith("hint: ")
+        return done.err
+
+    assert "unknown table 'tabel1'" in refused("plan", "tabel1")
+    assert "did you mean 'table1'" in refused("run", "tabel1")
+    assert "did you mean 'irm'" in refused("run", "table1", "--methods", "erm,imr")
+    assert "table1 has no row of 'reacher'" in refused("plan", "table1", "--env", "reacher")
+    assert "figure2 takes no --env" in refused("plan", "figure2", "--env", "ant")
+    assert "experts takes no --seeds" in refused("plan", "experts", "--seeds", "1")
+    assert "did you mean 'rewards'" in refused("run", "table1", "--until", "reward")
+    step = "smoke.lunar-lander.bounce.irm.0.transfr"
+    assert "did you mean 'smoke.lunar-lander.bounce.irm.0.transfer'" in refused(
+        "run", "table1", "--profile", "smoke", "--only", step
+    )
+    assert "--tag NAME" in refused("run", "table1", "--set", "airl.penalty_weight=3")
+    assert "cannot be a name" in refused("run", "table1", "--tag", "a b")
+    assert "--choose-penalty" in refused("run", "experts", "--choose-penalty", "1,2", "--tag", "x")
+    own = tmp_path / "mine.toml"
+    own.write_text(SOUND.replace("leg-length", "leg-lenght"))
+    assert f"{own}: mine.rows" in refused("plan", "mine", "--experiments", own)
+    assert "cannot be read" in refused("plan", "mine", "--experiments", tmp_path / "none.toml")
