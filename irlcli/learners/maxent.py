@@ -73,7 +73,7 @@ def group_risks(
     """
     e, n, _ = settings.shape
     rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
-    groups = group(grouping, demos.counts, rng)
+    groups = group(grouping, demos.counts.tolist(), rng)
     if grouping == "balanced":
         parts = [Part(p.episodes, g.weight * p.share) for g in groups for p in g.parts]
         groups = [Group(tuple(parts), 1.0)]
@@ -257,6 +257,7 @@ class MaxEnt:
         self._optimizer.zero_grad()
         reward.backward(torch.as_tensor(gradient))
         for parameter in self.networks.parameters():
+            assert parameter.grad is not None
             parameter.grad += self._l2 * parameter.detach()
         self._optimizer.step()
         self.iterations += 1

@@ -9,7 +9,7 @@ import msgspec
 from irlcli.configs import Config
 from irlcli.interventions import Setting
 from irlcli.stages import sweep_maxent
-from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
 from irlcli.stages.sweep_maxent import PAPER_L2, PAPER_PENALTY_WEIGHTS, PENALTIES, Variant
 from irlcli.stages.train_maxent import indexed, read_gridworld
 
@@ -32,12 +32,12 @@ def request(
         UsageError: as :func:`irlcli.stages.sweep_maxent.request`.
     """
     sweep = sweep_maxent.request(env, settings_, unseen, config)
-    drawn = sweep_maxent.datasets(env, settings_, config)[0]
+    seed, drawn = next(iter(sweep_maxent.datasets(env, settings_, config).items()))
     parameters = Parameters(
-        environment=sweep.parameters.environment,
-        settings=sweep.parameters.settings,
-        unseen=sweep.parameters.unseen,
-        seed=drawn.parameters.seed,
+        environment=environment_key(env),
+        settings=tuple(str(s) for s in settings_),
+        unseen=tuple(str(s) for s in unseen),
+        seed=seed,
     )
     inputs = {"sweep": From(sweep), "demonstrations": From(drawn)}
     return Request(STAGE, parameters, inputs, f"figure2 {env}")

@@ -73,13 +73,13 @@ def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Va
     return tuple(found)
 
 
-def datasets(env: str, settings_: Sequence[Setting], config: Config) -> list[Request]:
-    """The demonstrations that the sweep learns from, one request per seed."""
+def datasets(env: str, settings_: Sequence[Setting], config: Config) -> dict[int, Request]:
+    """The demonstrations that the sweep learns from, by seed."""
     f: Figure2Config = config.figure2
-    return [
-        collect_experts.request(env, settings_, config, seed, f.episodes)
+    return {
+        seed: collect_experts.request(env, settings_, config, seed, f.episodes)
         for seed in range(f.first_seed, f.first_seed + f.seeds)
-    ]
+    }
 
 
 def request(
@@ -101,12 +101,12 @@ def request(
         environment=environment_key(env),
         settings=texts,
         unseen=tuple(str(s) for s in unseen),
-        seeds=tuple(r.parameters.seed for r in requests),
+        seeds=tuple(requests),
         variants=variants(config.figure2.penalty_weights, config.figure2.l2s),
         gridworld=config.gridworld,
         shared=relevant_maxent(shared),
     )
-    inputs = {f"demonstrations {r.parameters.seed}": From(r) for r in requests}
+    inputs = {f"demonstrations {seed}": From(demos) for seed, demos in requests.items()}
     label = f"sweep-maxent {env} {', '.join(texts)} {len(requests)} datasets"
     return Request(STAGE, parameters, inputs, label)
 

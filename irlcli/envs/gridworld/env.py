@@ -19,7 +19,7 @@ gate. No expert demonstrates in these mazes.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -216,7 +216,7 @@ class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
         ValueError: as :func:`gridworld`.
     """
 
-    metadata: ClassVar = {"render_modes": ["ansi"], "render_fps": 4}
+    metadata: dict[str, Any] = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012
 
     def __init__(
         self,
@@ -244,7 +244,7 @@ class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
         self._state = int(self.mdp.start.argmax())
         return self._observations[self._state].copy(), {}
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One move: observation [2] float32, true reward, terminated, truncated (never), info."""
         reward = float(self.mdp.reward[self._state])
         after = self.mdp.afterstate[int(action), self._state]
