@@ -1,0 +1,380 @@
+"""Keys are complete: every field, the physics, the horizon and the versions change them.
+
+For each stage a request is built from a config in which every option is in use. Then each field
+of the whole config is changed, one at a time: the key changes if and only if the field belongs to
+the stage or to one of its inputs.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any, Literal, get_args, get_origin
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from irlcli import stages
+from irlcli.configs import Config, InterventionConfig
+from irlcli.envs.registry import ENVIRONMENTS
+from irlcli.errors import UsageError
+from irlcli.interventions import parse_settings
+from irlcli.learners import LEARNERS
+from irlcli.penalties import PENALTIES
+from irlcli.rl import ALGORITHMS
+from irlcli.stages import (
+    choose_penalty,
+    collect_experts,
+    evaluate,
+    figure2,
+    sweep_maxent,
+    train_airl,
+    train_expert,
+    train_maxent,
+    transfer,
+)
+from irlcli.stages.base import From, Request
+from irlcli.store import KeyRecord
+
+# Continuous actions, so that no option is refused; three settings, so that two remain where one
+# is left out or selects the round.
+ENV, MAZE = "reacher", "gridworld"
+SETTINGS = parse_settings(ENV, "gravity=0.5x,1x,2x")
+(UNSEEN,) = parse_settings(ENV, "gravity=4x")
+PATHS = parse_settings(MAZE, "path-group=1,2,3")
+BLOCKED = parse_settings(MAZE, "blocked=1")
+
+
+def key(request: Request) -> str:
+    """The key of ``request``, with every input known by the key of its own request."""
+    inputs = {
+        role: f"{key(source.request)}/{source.output}"
+        if isinstance(source, From)
+        else source.sha256
+        for role, source in request.inputs.items()
+    }
+    parameters = msgspec.to_builtins(request.parameters)
+    return KeyRecord(request.stage.name, request.stage.version, parameters, inputs).key
+
+
+def expert(config: Config, seed: int = 0) -> Request:
+    return train_expert.request(ENV, SETTINGS[0], seed, config.expert_of(SETTINGS[0]))
+
+
+def demos(config: Config, seed: int = 0) -> Request:
+    return collect_experts.request(ENV, SETTINGS, config, seed)
+
+
+def tabular_demos(config: Config, seed: int = 0) -> Request:
+    return collect_experts.request(MAZE, PATHS, config, seed)
+
+
+def airl(config: Config, seed: int = 0) -> Request:
+    return train_airl.request(From(demos(config)), ENV, SETTINGS, config.airl, seed)
+
+
+def chosen(config: Config, seed: int = 0) -> Request:
+    learned = replace(config.airl, select="episodes")
+    return choose_penalty.request(
+        From(demos(config)), ENV, SETTINGS, learned, config.evaluation, [1.0, 10.0], seed
+    )
+
+
+def maxent(config: Config, seed: int = 0) -> Request:
+    return train_maxent.request(
+        From(tabular_demos(config)), MAZE, PATHS, BLOCKED, config.maxent, seed
+    )
+
+
+def sweep(config: Config) -> Request:
+    return sweep_maxent.request(MAZE, PATHS, BLOCKED, config)
+
+
+def figure(config: Config) -> Request:
+    return figure2.request(MAZE, PATHS, BLOCKED, config)
+
+
+def retrained(config: Config, seed: int = 0) -> Request:
+    reward = From(airl(config), "reward.pt")
+    return transfer.request(reward, ENV, UNSEEN, config.transfer, seed)
+
+
+def score(config: Config, seed: int = 0) -> Request:
+    policy = From(retrained(config), "policy.pt")
+    return evaluate.request(ENV, [UNSEEN], config.evaluation, policy, seed=seed)
+
+
+# Stage to its request, and to the sections and fields that its key depends on.
+REQUESTS = {
+    "train-expert": (expert, ["expert"]),
+    "collect-experts": (demos, ["expert", "demonstrations"]),
+    "collect-experts tabular": (tabular_demos, ["demonstrations.episodes", "gridworld"]),
+    "train-airl": (airl, ["expert", "demonstrations", "airl"]),
+    "choose-penalty": (chosen, ["expert", "demonstrations", "airl", "evaluation"]),
+    "train-maxent": (maxent, ["demonstrations.episodes", "gridworld", "maxent"]),
+    "sweep-maxent": (sweep, ["gridworld", "maxent", "figure2"]),
+    "figure2": (figure, ["gridworld", "maxent", "figure2"]),
+    "transfer": (retrained, ["expert", "demonstrations", "airl", "transfer"]),
+    "evaluate": (score, ["expert", "demonstrations", "airl", "transfer", "evaluation"]),
+}
+# Reports read evaluations that are named one by one; no config field reaches them otherwise.
+REPORTS = {"report", "report-experts"}
+# What a stage does not read, whatever the other fields are.
+UNREAD = {
+    # The bar is for the report of the experts.
+    "": ["expert.bar"],
+    # AIRL refuses gSDE, so its frequency is not read.
+    "train-airl": ["airl.ppo.sde_sample_freq"],
+    "transfer": ["airl.ppo.sde_sample_freq"],
+    "evaluate": ["airl.ppo.sde_sample_freq"],
+    # Both are replaced: the weight by the candidates, the selection by the request above.
+    "choose-penalty": [
+        *("airl.ppo.sde_sample_freq", "airl.penalty_weight"),
+        *("airl.select", "airl.select_episodes"),
+    ],
+    # The sweep's variants replace these.
+    "sweep-maxent": [f"maxent.{n}" for n in ("grouping", "penalty", "penalty_weight", "l2")],
+    "figure2": [f"maxent.{n}" for n in ("grouping", "penalty", "penalty_weight", "l2")],
+}
+REFUSED = ["airl.ppo.use_sde"]
+# Fields whose type does not tell another valid value.
+CHANGED = {
+    "expert.bar": 1.0,
+    "airl.learner": "other",
+    "airl.penalty": "other",
+    "airl.select": "episodes",
+    "transfer.algorithm": "other",
+    "maxent.penalty": "other",
+    "figure2.episodes": (400, 25, 4),
+}
+
+
+def with_field(struct: Any, path: str, value: Any) -> Any:
+    """``struct`` with the field at the dotted ``path`` replaced."""
+    name, _, rest = path.partition(".")
+    return replace(
+        struct, **{name: with_field(getattr(struct, name), rest, value) if rest else value}
+    )
+
+
+def field_of(struct: Any, path: str) -> Any:
+    for name in path.split("."):
+        struct = getattr(struct, name)
+    return struct
+
+
+def in_use() -> Config:
+    """A config in which every option is in use."""
+    config = Config()
+    for path, value in {
+        "expert.ppo.use_sde": True,
+        "transfer.ppo.use_sde": True,
+        "expert.ppo.sde_sample_freq": 4,
+        "transfer.ppo.sde_sample_freq": 4,
+        # A multiple of two and of three settings.
+        "airl.ppo.n_envs": 12,
+        "airl.grouping": "per-setting",
+        "airl.penalty": "irmv1",
+        "airl.select": str(SETTINGS[0]),
+        "maxent.grouping": "per-setting",
+        "maxent.penalty": "irmv1",
+    }.items():
+        config = with_field(config, path, value)
+    return config
+
+
+def leaves(kind: type[msgspec.Struct], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted path and type of every field."""
+    for field in msgspec.structs.fields(kind):
+        path = f"{prefix}{field.name}"
+        if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
+            yield from leaves(field.type, f"{path}.")
+        elif path != "interventions":
+            yield path, field.type
+
+
+FIELDS = dict(leaves(Config))
+
+
+def another(path: str, value: Any) -> Any:
+    """A valid value of the field at ``path`` that differs from ``value``."""
+    if path in CHANGED:
+        return CHANGED[path]
+    kind = FIELDS[path]
+    while get_origin(kind) not in (None, Literal, tuple) and not isinstance(value, bool):
+        # Unwrap Annotated and Optional.
+        kind = get_args(kind)[0]
+    if get_origin(kind) is Literal:
+        return next(v for v in get_args(kind) if v != value)
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, tuple):
+        return (*value, 2 * value[-1])
+    if value is None:
+        return 3
+    return value * 2 or 1 if isinstance(value, int) else value / 2 or 0.5
+
+
+@pytest.fixture(autouse=True)
+def a_second_learner_algorithm_and_penalty(monkeypatch):
+    monkeypatch.setitem(LEARNERS, "other", LEARNERS["airl"])
+    monkeypatch.setitem(ALGORITHMS, "other", ALGORITHMS["ppo"])
+    monkeypatch.setitem(PENALTIES, "other", PENALTIES["irmv1"])
+
+
+def test_every_stage_is_covered():
+    modules = [
+        importlib.import_module(f"irlcli.stages.{m.name}")
+        for m in pkgutil.iter_modules(stages.__path__)
+    ]
+    names = {module.STAGE.name for module in modules if hasattr(module, "STAGE")}
+    assert names == {name.removesuffix(" tabular") for name in REQUESTS} | REPORTS
+
+
+@pytest.mark.parametrize("stage", REQUESTS)
+def test_a_key_depends_on_exactly_the_fields_that_matter(stage):
+    request, sections = REQUESTS[stage]
+    config = in_use()
+    before = key(request(config))
+    unread = [*UNREAD[""], *UNREAD.get(stage, [])]
+    wrong = []
+    for path in FIELDS:
+        matters = any(path == s or path.startswith(f"{s}.") for s in sections)
+        changed = with_field(config, path, another(path, field_of(config, path)))
+        assert changed != config, path
+        try:
+            differs = key(request(changed)) != before
+        except UsageError:
+            assert path in REFUSED
+            continue
+        if differs != (matters and path not in unread):
+            wrong.append(path)
+    assert not wrong
+
+
+# Config changes, and the fields that they make irrelevant.
+PENALTY_FIELDS = ["weight", "warmup_rounds", "ramp_rounds", "scaling", "estimate"]
+IRRELEVANT = [
+    (expert, {"expert.ppo.use_sde": False}, ["expert.ppo.sde_sample_freq"]),
+    (expert, {"expert.ppo.ent_coef": 0.0}, ["expert.ppo.ent_coef_schedule"]),
+    (expert, {"expert.ppo.batch_size": 1 << 20}, ["expert.ppo.batch_size"]),
+    (retrained, {"transfer.ppo.use_sde": False}, ["transfer.ppo.sde_sample_freq"]),
+    (retrained, {"transfer.ppo.ent_coef": 0.0}, ["transfer.ppo.ent_coef_schedule"]),
+    (airl, {"airl.penalty": "none"}, [f"airl.penalty_{name}" for name in PENALTY_FIELDS]),
+    (
+        airl,
+        {"airl.penalty_weight": 0.0},
+        ["airl.penalty", *(f"airl.penalty_{name}" for name in PENALTY_FIELDS[1:])],
+    ),
+    (airl, {"airl.grouping": "pooled"}, ["airl.pairing"]),
+    (
+        airl,
+        {"airl.replay_share": 0.0},
+        ["airl.replay_episodes_per_round", "airl.replay_capacity"],
+    ),
+    (airl, {"airl.select": "last"}, ["airl.select_every", "airl.select_episodes"]),
+    (airl, {"airl.select": "episodes"}, ["airl.select_episodes"]),
+    (airl, {"airl.ppo.ent_coef": 0.0}, ["airl.ppo.ent_coef_schedule"]),
+    (maxent, {"maxent.penalty": "none"}, ["maxent.penalty_weight"]),
+    (maxent, {"maxent.penalty_weight": 0.0}, ["maxent.penalty"]),
+    (maxent, {"maxent.features": "linear"}, ["maxent.hidden"]),
+    (sweep, {"maxent.features": "linear"}, ["maxent.hidden"]),
+]
+
+
+@pytest.mark.parametrize(("request_", "changes", "fields"), IRRELEVANT)
+def test_fields_without_influence_do_not_change_the_key(request_, changes, fields):
+    config = in_use()
+    for path, value in changes.items():
+        config = with_field(config, path, value)
+    for path in fields:
+        changed = with_field(config, path, another(path, field_of(config, path)))
+        assert changed != config and key(request_(changed)) == key(request_(config)), path
+
+
+@pytest.mark.parametrize(("request_", "section"), [(airl, "airl"), (maxent, "maxent")])
+def test_settings_of_equal_weight_are_one_grouping_without_a_penalty(request_, section):
+    config = with_field(in_use(), f"{section}.penalty", "none")
+    balanced = with_field(config, f"{section}.grouping", "balanced")
+    assert key(request_(config)) == key(request_(balanced))
+
+
+def test_the_random_and_the_idle_agent_have_no_deterministic_variant():
+    config = in_use()
+    changed = with_field(config, "evaluation.deterministic", True)
+    for agent in ("random", "idle"):
+        keys = {
+            key(evaluate.request(ENV, [UNSEEN], c.evaluation, agent=agent))
+            for c in (config, changed)
+        }
+        assert len(keys) == 1
+
+
+@pytest.mark.parametrize("change", ["physics", "max_episode_steps"])
+@pytest.mark.parametrize("stage", REQUESTS)
+def test_physics_and_horizon_change_every_key(monkeypatch, stage, change):
+    request, _ = REQUESTS[stage]
+    before = key(request(in_use()))
+    for env in (ENV, MAZE):
+        spec = ENVIRONMENTS[env]
+        changed = spec._replace(**{change: getattr(spec, change) + 1})
+        monkeypatch.setitem(ENVIRONMENTS, env, changed)
+    assert key(request(in_use())) != before
+
+
+def makers(request: Request) -> set[str]:
+    """The stages that a request and its inputs run."""
+    inputs = (source.request for source in request.inputs.values() if isinstance(source, From))
+    return {request.stage.name}.union(*map(makers, inputs))
+
+
+MODULES: list[tuple[ModuleType, str]] = [
+    *((m, "STAGE") for m in (train_expert, collect_experts, train_airl, choose_penalty, transfer)),
+    *((m, "STAGE") for m in (evaluate, train_maxent, sweep_maxent, figure2)),
+    (collect_experts, "TABULAR_STAGE"),
+]
+
+
+@pytest.mark.parametrize("stage", REQUESTS)
+def test_the_version_of_a_stage_changes_its_key_and_those_made_from_it(monkeypatch, stage):
+    request, _ = REQUESTS[stage]
+    original = request(in_use())
+    before = key(original)
+    for module, name in MODULES:
+        old = getattr(module, name)
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, old._replace(version=old.version + 1))
+            differs = key(request(in_use())) != before
+        tabular = ENV not in str(original.label)
+        runs = old.name in makers(original) and (
+            old.name != "collect-experts" or (name == "TABULAR_STAGE") == tabular
+        )
+        assert differs == runs, name
+
+
+@pytest.mark.parametrize("stage", [s for s in REQUESTS if s not in ("sweep-maxent", "figure2")])
+def test_the_seed_changes_the_key(stage):
+    request, _ = REQUESTS[stage]
+    assert key(request(in_use(), seed=1)) != key(request(in_use(), seed=0))
+
+
+def test_settings_and_their_order_change_the_key():
+    """The order is that of the risks and of the worlds."""
+    config = in_use()
+    keys = {
+        key(train_airl.request(From(demos(config)), ENV, chosen_settings, config.airl))
+        for chosen_settings in (SETTINGS, SETTINGS[::-1], SETTINGS[:2])
+    }
+    assert len(keys) == 3
+
+
+def test_the_expert_config_of_a_knob_changes_the_keys_of_its_experts_only():
+    config = in_use()
+    longer = replace(config.expert, total_steps=2 * config.expert.total_steps)
+    for knob, differs in (("gravity", True), ("another", False)):
+        interventions = {knob: InterventionConfig(id=(), ood=(), expert=longer)}
+        changed = replace(config, interventions=interventions)
+        assert (key(demos(changed)) != key(demos(config))) == differs
