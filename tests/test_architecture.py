@@ -54,7 +54,7 @@ NEVER = {
 }
 EXCEPTIONS = {
     # GIFs of a policy at work.
-    "report/animation.py": {"torch", "irlcli.rl"},
+    "report/animation.py": {"irlcli.rl"},
 }
 
 
