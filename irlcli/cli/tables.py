@@ -116,7 +116,7 @@ def print_report(session: StageSession, artefact: Artefact, kind: str) -> None:
     _warn_of_versions(session, artefact)
     report = report_json(session, artefact, kind)
     if report is None:
-        out.print_note(session.store.open(artefact, f"{kind}.md").read_text().rstrip())
+        out.print_note(session.store.open(artefact, "README.md").read_text().rstrip())
         return
     for table in report["tables"]:
         if table["title"] != "Every cell":

@@ -21,6 +21,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from irlcli.report.statistics import bootstrap_interval
+from irlcli.report.tables import markdown_table
 
 MEASURES = (
     "goal_probability",
@@ -82,6 +83,22 @@ def table(summarised: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], l
             row.append(f"{c['mean']:.{digits}f} [{c['low']:.{digits}f}, {c['high']:.{digits}f}]")
         rows.append(row)
     return ["method", *(w[0] for w in wanted)], rows
+
+
+def page(summarised: pd.DataFrame, unseen: Sequence[str], facts: Sequence[str]) -> str:
+    """The picture and the table as Markdown; ``facts`` are what they were made from."""
+    listed = "\n".join(f"- {fact}." for fact in facts)
+    return f"""# Figure 2
+
+![Figure 2](figure2.png)
+
+{listed}
+
+Cells are means over the datasets, with bootstrap 95 % intervals. *Worst trained* is the worst of the
+settings trained on, in each dataset. The number after a penalty is its lambda, after `l2` the L2
+weight. `irm-shuffled` deals the episodes out to the risks at random; every setting keeps its weight.
+
+{markdown_table(*table(summarised, unseen))}"""
 
 
 def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from irlcli.configs import Config
+from irlcli.configs import Config, MaxEntConfig
 from irlcli.interventions import Setting
 from irlcli.stages import sweep_maxent
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
@@ -15,18 +15,22 @@ from irlcli.stages.train_maxent import indexed, read_gridworld
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
-    """What the figure depends on, besides the sweep; ``seed`` is the dataset that is drawn."""
+    """What the figure depends on, besides the sweep.
+
+    ``seed`` is the dataset that is drawn, ``shared`` the sweep's hyperparameters, for the caption.
+    """
 
     environment: EnvironmentKey
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seed: int
+    shared: MaxEntConfig
 
 
 def request(
     env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Config
 ) -> Request:
-    """Outputs ``figure2.png``, ``.pdf``, ``.csv`` (every measure) and ``.md`` (the table).
+    """Outputs ``figure2.png``, ``.pdf``, ``.csv`` (every measure) and ``README.md`` (the table).
 
     Raises:
         UsageError: as :func:`irlcli.stages.sweep_maxent.request`.
@@ -38,6 +42,7 @@ def request(
         settings=tuple(str(s) for s in settings_),
         unseen=tuple(str(s) for s in unseen),
         seed=seed,
+        shared=sweep_maxent.shared_config(config),
     )
     inputs = {"sweep": From(sweep), "demonstrations": From(drawn)}
     return Request(STAGE, parameters, inputs, f"figure2 {env}")
@@ -65,7 +70,7 @@ def run(job: Job) -> None:
     from irlcli.envs.gridworld import tasks
     from irlcli.envs.gridworld.env import walls
     from irlcli.interventions import env_kwargs, parse_setting
-    from irlcli.report import figure2, tables
+    from irlcli.report import figure2
     from irlcli.tabular import intended_path, optimal_policy
 
     p: Parameters = job.parameters
@@ -99,8 +104,17 @@ def run(job: Job) -> None:
     summary.to_csv(
         job.output / "figure2.csv", index=False, float_format="%.6g", lineterminator="\n"
     )
-    text = tables.markdown_table(*figure2.table(summary, p.unseen))
-    (job.output / "figure2.md").write_text(text)
+    m = p.shared
+    facts = [
+        f"Datasets: {summary['datasets'].iloc[0]}, seeds from {p.seed}, each with "
+        + ", ".join(f"{len(group)} episodes in {t}" for t, group in paths.items()),
+        f"Gridworld: size {grid.size}, horizon {grid.horizon}, {grid.goal} goal, "
+        f"slip probability {grid.p_slip:g}",
+        f"Reward: {m.features}, of {m.inputs} inputs"
+        + (f", {m.hidden} hidden units" if m.features == "learned" else ""),
+        f"Fit: {m.iterations} iterations of RMSProp at learning rate {m.learning_rate:g}",
+    ]
+    (job.output / "README.md").write_text(figure2.page(summary, p.unseen, facts))
 
 
-STAGE = Stage("figure2", 3, run)
+STAGE = Stage("figure2", 4, run)

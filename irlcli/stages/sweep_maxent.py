@@ -44,7 +44,7 @@ class Variant(msgspec.Struct, frozen=True, kw_only=True):
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the sweep depends on, besides its datasets (``seeds``, in the order of the inputs).
 
-    ``shared`` are the hyperparameters of all variants; what the variants replace is at its default.
+    ``shared`` is :func:`shared_config`.
     """
 
     environment: EnvironmentKey
@@ -73,6 +73,11 @@ def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Va
     return tuple(found)
 
 
+def shared_config(config: Config) -> MaxEntConfig:
+    """The hyperparameters of all variants; what the variants replace is at its default."""
+    return relevant_maxent(replace(config.maxent, **asdict(Variant(grouping="pooled"))))
+
+
 def datasets(env: str, settings_: Sequence[Setting], config: Config) -> dict[int, Request]:
     """The demonstrations that the sweep learns from, by seed."""
     f: Figure2Config = config.figure2
@@ -96,7 +101,6 @@ def request(
     check_tabular(env, "sweep-maxent", wanted=True)
     texts = tuple(str(s) for s in settings_)
     requests = datasets(env, settings_, config)
-    shared = replace(config.maxent, **asdict(Variant(grouping="pooled")))
     parameters = Parameters(
         environment=environment_key(env),
         settings=texts,
@@ -104,7 +108,7 @@ def request(
         seeds=tuple(requests),
         variants=variants(config.figure2.penalty_weights, config.figure2.l2s),
         gridworld=config.gridworld,
-        shared=relevant_maxent(shared),
+        shared=shared_config(config),
     )
     inputs = {f"demonstrations {seed}": From(demos) for seed, demos in requests.items()}
     label = f"sweep-maxent {env} {', '.join(texts)} {len(requests)} datasets"

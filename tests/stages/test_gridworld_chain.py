@@ -177,8 +177,9 @@ def test_figure_and_table(run, store):
     assert {r["variant"] for r in rows} == names
     assert {r["setting"] for r in rows} == {*GROUPS, *UNSEEN, "worst"}
     assert all(float(r["low"]) <= float(r["mean"]) <= float(r["high"]) for r in rows)
-    assert (artefact / "figure2.md").read_text().count("\n") == 2 + len(names)
-    assert (artefact / "figure2.md").read_text() in first.err
+    page = (artefact / "README.md").read_text()
+    assert sum(line.startswith("| ") for line in page.splitlines()) == 2 + len(names)
+    assert "20 episodes in path-group=1" in page and page in first.err
     plan = run("report", "figure2", "--dry-run").out.splitlines()
     assert len(plan) == 4 and all(line.startswith("HIT") for line in plan)
     lineage = run_light("lineage", "fig", "--store", store)
