@@ -2,12 +2,11 @@
 
     python benchmarks/maxent.py [--imitation PYTHON]
 
-Prints, from this one run, the time of a backward and forward pass on a 32x32 grid over 128 steps
-beside that of a dense solver that does what HumanCompatibleAI/imitation's ``mce_irl`` does, and
-the cost per state up to 256x256. ``PYTHON``, an interpreter with ``imitation==1.0.1``, times and
-checks against imitation itself. Set ``OMP_NUM_THREADS=1``: the dense solvers' products then use one
-core, as ours always does. The least times are what to compare: whatever else the machine does can
-only add to them.
+Prints two tables: the time of a backward and forward pass on a 32x32 grid over 128 steps, beside a
+dense solver that computes what HumanCompatibleAI/imitation's ``mce_irl`` does; and the cost per
+state up to 256x256. With ``PYTHON``, an interpreter that has ``imitation==1.0.1``, imitation itself
+is timed and its results compared. Set ``OMP_NUM_THREADS=1``, so that the dense solvers use one core
+as ours always does. Compare the least times: other load can only add to a time.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def dense_solve(transitions, start, reward, horizon):
 
 
 def best_of(repeats: int, call) -> tuple[float, float]:
-    """Least and median seconds of ``call``, which once ran before to warm up."""
+    """Least and median seconds of ``call``, after one call to warm up."""
     call()
     times = []
     for _ in range(repeats):
@@ -83,10 +82,10 @@ def compare(imitation: str | None) -> None:
     settings = stack([mdp])
     rewards = np.random.default_rng(0).normal(size=(RUNS, SIZE**2))
     transitions = np.ascontiguousarray(dense_transitions(mdp).transpose(1, 0, 2))
-    # T values of the dense solver are T - 1 moves: the reward of its last action's outcome is
-    # not paid. Its policies and states agree with those of a horizon of T - 1.
+    # T values of the dense solver are T - 1 moves, because it omits the reward of the last
+    # action's outcome. Its policies and states equal ours for a horizon of T - 1.
     matching = solve(settings, rewards[:1], HORIZON - 1)
-    # As a fit iterates: in the memory of the iteration before.
+    # A fit also reuses the memory of its previous iteration.
     one, many = (solve(settings, r, HORIZON) for r in (rewards[:1], rewards))
     ours = best_of(100, lambda: solve(settings, rewards[:1], HORIZON, reuse=one))
     batch = best_of(10, lambda: solve(settings, rewards, HORIZON, reuse=many))

@@ -16,6 +16,7 @@ from irlcli.tabular import (
     evaluate,
     forward,
     hard_backup,
+    intended_path,
     optimal_policy,
     shortest_path_length,
     stack,
@@ -97,6 +98,13 @@ def test_value_iteration_is_optimal_among_all_policies_of_a_tiny_mdp():
         best = max(best, float((occupancy[0, 0] * mdp.reward).sum()))
     _, value = backward(settings, reward, 2, hard_backup)
     assert float(mdp.start @ value[0, :, 0]) == pytest.approx(best, abs=1e-12)
+
+
+def test_the_intended_path_ignores_slips_and_stays_at_the_goal():
+    mdp = gridworld(3, goal="absorbing", p_slip=0.5)
+    up, right = np.eye(4)[0], np.eye(4)[1]
+    policy = np.stack([right, up, right, up, up])[:, :, None].repeat(9, axis=2)
+    assert intended_path(mdp, policy).tolist() == [0, 1, 4, 5, 8, 8]
 
 
 def test_a_grid_too_large_for_the_dense_solver_is_refused():

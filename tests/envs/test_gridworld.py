@@ -94,7 +94,7 @@ def test_sampled_trajectories_agree_with_the_exact_evaluation():
     )
 
 
-def test_trajectories_start_and_end_where_they_must_and_depend_on_their_seed_only():
+def test_trajectories_run_from_start_to_goal_and_depend_on_their_seed_only():
     mdp = gridworld(6)
     policy = expert_policy(mdp, 40)
     five = sample_trajectories(mdp, 6, policy, 5, seed=10)
@@ -132,7 +132,7 @@ def test_path_groups_take_different_corridors():
 
 
 @pytest.mark.parametrize("size", [5, 6, 7, 8, 9, 16, 33])
-def test_unseen_walls_leave_a_way_and_are_no_training_setting(size):
+def test_unseen_walls_leave_a_path_and_differ_from_all_training_settings(size):
     training = [walls(size, path_group=g) for g in PATH_GROUPS]
     for blocked in (1, 2):
         wall = walls(size, blocked=blocked)
@@ -152,7 +152,7 @@ def test_experts_are_uniform_over_ties_and_optimal_without_slips():
 
 
 @pytest.mark.parametrize("size", [2, 3, 8, 100, 256])
-def test_observations_give_the_state_back_exactly(size):
+def test_observations_identify_the_state_exactly(size):
     everything = observations(size)
     assert everything.dtype == np.float32 and len(np.unique(everything, axis=0)) == size**2
     assert np.array_equal(state_indices(everything, size), np.arange(size**2))
@@ -166,7 +166,7 @@ def test_environment_passes_gymnasiums_checker(goal):
         check_env(Gridworld(6, path_group=2.0, goal=goal), skip_render_check=True)
 
 
-def test_environment_replays_from_a_seed_and_draws_itself():
+def test_environment_replays_from_a_seed_and_renders_as_text():
     env = Gridworld(5, render_mode="ansi")
     runs = []
     for _ in range(2):
@@ -205,7 +205,7 @@ def test_a_horizon_shorter_than_the_path_is_refused():
     expert_policy(gridworld(6), 10)
 
 
-def test_observations_of_something_else_are_refused():
+def test_observations_of_another_environment_are_refused():
     with pytest.raises(ValueError, match="2 numbers"):
         state_indices(np.zeros((3, 8), np.float32), 8)
     with pytest.raises(ValueError, match="outside"):
@@ -214,7 +214,7 @@ def test_observations_of_something_else_are_refused():
         state_indices(observations(7), 8)
 
 
-def test_no_episodes_are_refused():
+def test_zero_episodes_are_refused():
     mdp = gridworld(3)
     with pytest.raises(ValueError, match="at least one episode"):
         sample_trajectories(mdp, 3, expert_policy(mdp, 8), 0, seed=0)
