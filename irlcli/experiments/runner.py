@@ -128,7 +128,11 @@ class Runner:
             _file_errors_of(request.label),
             self.store.working_on(record.key, self.wait, partial(self.console.wait, request.label)),
         ):
-            return self.store.find(record.key) or self._adopt(request, record)
+            artefact = self.store.find(record.key)
+            if artefact is None:
+                copied = self._adopt(record)
+                artefact = None if copied is None else copied[0]
+            return artefact
 
     def name(self, name: str, artefact: Artefact) -> None:
         """Let ``name`` stand for ``artefact``, and warn if another one loses it: gc may take that."""
@@ -161,10 +165,15 @@ class Runner:
             if artefact is not None:
                 self.console.finish(request.label, artefact, hit=True)
                 return artefact
-            return self._adopt(request, record) or self._compute(request, record, sources, scratch)
+            copied = self._adopt(record)
+            if copied is None:
+                return self._compute(request, record, sources, scratch)
+            artefact, where = copied
+            self.console.found(request.label, artefact, where)
+            return artefact
 
-    def _adopt(self, request: Request, record: KeyRecord) -> Artefact | None:
-        """A verified copy of the artefact from one of the sources, if one has it."""
+    def _adopt(self, record: KeyRecord) -> tuple[Artefact, Path] | None:
+        """A verified copy of the artefact, and the source that has it; None if none has."""
         if not self.sources:
             return None
         from irlcli.store.substitute import find_in
@@ -175,9 +184,7 @@ class Runner:
         published = self.store.adopt(found.store, found.artefact)
         if published is None:
             return None
-        artefact = published.diverged or published.artefact
-        self.console.found(request.label, artefact, found.store.root)
-        return artefact
+        return published.diverged or published.artefact, found.store.root
 
     def _compute(
         self, request: Request, record: KeyRecord, sources: Mapping[str, Source], scratch: Any

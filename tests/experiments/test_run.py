@@ -1,0 +1,267 @@
+"""``irl run``: one process per missing artefact, restartable, several runs at once."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from irlcli.store import Store
+
+TABLES = """
+[tiny]
+title = "Engine power"
+rows = ["lunar-lander.engine-power"]
+methods = ["erm", "irm"]
+seeds = [0]
+measures = ["zero-shot"]
+"""
+ROW = "smoke.lunar-lander.engine-power"
+REWARDS = ["--until", "rewards"]  # three experts, the demonstrations, two rewards
+
+
+class Runs:
+    """``irl run tiny`` in processes of its own, with stages that compute next to nothing."""
+
+    def __init__(self, directory: Path):
+        self.log = directory / "log"
+        self.log.touch()
+        self.tables = directory / "tables.toml"
+        self.tables.write_text(TABLES)
+
+    def start(self, store: Path, *more: object, **environment: str) -> subprocess.Popen:
+        words = ["run", "tiny", "--experiments", self.tables, "--profile", "smoke"]
+        line = [sys.executable, "-m", "irlcli", *words, "--store", store, *more]
+        fakes = str(Path(__file__).parent / "fake_stages")
+        path = os.pathsep.join([fakes, *filter(None, [os.environ.get("PYTHONPATH")])])
+        return subprocess.Popen(
+            [str(word) for word in line],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": path, "IRL_TEST_LOG": str(self.log), **environment},
+        )
+
+    def run(self, store: Path, *more: object, code: int = 0, **environment: str) -> str:
+        """What a run printed on stderr."""
+        process = self.start(store, *more, **environment)
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode == code, errors
+        return errors
+
+    def lines(self) -> list[dict]:
+        return [json.loads(line) for line in self.log.read_text().splitlines()]
+
+    def processes(self) -> list[str]:
+        """The step of each child process that was started."""
+        started = [line["argv"] for line in self.lines() if "argv" in line]
+        return [argv[argv.index("--only") + 1] for argv in started if "--only" in argv]
+
+    def computed(self) -> Counter:
+        """How often each result was computed, or resumed."""
+        return Counter(
+            json.dumps(line["parameters"]) for line in self.lines() if "computes" in line
+        )
+
+    def wait_for(self, found, process: subprocess.Popen) -> None:
+        while not any(found(line) for line in self.lines()):
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def runs(tmp_path):
+    return Runs(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """The ids of a run that nothing disturbed, and its log."""
+    directory = tmp_path_factory.mktemp("uninterrupted")
+    runs = Runs(directory)
+    runs.run(directory / "runs", "--jobs", "2", *REWARDS)
+    return Store(directory / "runs").ids(), runs
+
+
+def test_each_missing_artefact_has_one_process_and_one_name(uninterrupted):
+    ids, runs = uninterrupted
+    steps = ["expert.1x", "expert.1.25x", "expert.1.5x", "demos", "erm.0", "irm.0"]
+    assert sorted(runs.processes()) == sorted(f"{ROW}.{step}" for step in steps)
+    store = Store(runs.log.parent / "runs")
+    assert store.names() == {f"{ROW}.{step}": id16 for step, id16 in _named(store, steps)}
+    assert len(ids) == len(steps) and set(store.names().values()) == set(ids)
+    for name, id16 in store.names().items():
+        command = store.get(id16).provenance()["command"]
+        assert command[:5] == ["irl", "run", "tiny", "--only", name]
+    pids = {line["pid"] for line in runs.lines() if "computes" in line}
+    assert len(pids) == len(steps)
+
+
+def _named(store, steps):
+    return [(step, store.resolve(f"{ROW}.{step}").artefact.id) for step in steps]
+
+
+def test_what_exists_needs_no_process(uninterrupted, runs):
+    _, earlier = uninterrupted
+    store = earlier.log.parent / "runs"
+    before = earlier.log.read_bytes()
+    errors = runs.run(store, *REWARDS, "--experiments", earlier.tables)
+    assert "6 of 6 steps exist" in errors
+    assert runs.processes() == [] and earlier.log.read_bytes() == before
+
+
+def test_killed_and_started_again_it_ends_in_the_same_artefacts(uninterrupted, runs, tmp_path):
+    ids, _ = uninterrupted
+    store = tmp_path / "runs"
+    slow = {"IRL_TEST_ROUND": "0.2"}
+    for stage in ("train_expert", "train_airl"):
+        process = runs.start(store, *REWARDS, "--jobs", "2", **slow)
+        runs.wait_for(lambda line, s=stage: line.get("computes", "").startswith(s), process)
+        while not list(store.glob(".work/*/checkpoint")):
+            time.sleep(0.01)
+        # As a power cut: the run and its children.
+        process.kill()
+        for line in runs.lines():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(line["pid"], signal.SIGKILL)
+        process.communicate()
+    assert Store(store).ids() != ids
+    runs.run(store, *REWARDS, "--jobs", "2")
+    assert Store(store).ids() == ids
+    assert any(artefact.provenance()["resumed"] for artefact in Store(store).artefacts())
+    assert not list(store.glob(".work/*/checkpoint"))
+
+
+def test_children_of_a_killed_run_do_not_disturb_the_next(uninterrupted, runs, tmp_path):
+    """They either finish what they are at, or end; the next run waits for them."""
+    ids, _ = uninterrupted
+    store = tmp_path / "runs"
+    process = runs.start(store, *REWARDS, "--jobs", "2", IRL_TEST_ROUND="0.3")
+    runs.wait_for(lambda line: "computes" in line, process)
+    process.kill()
+    process.communicate()
+    runs.run(store, *REWARDS, "--jobs", "2")
+    assert Store(store).ids() == ids and not Store(store).verify(ids)
+
+
+def test_two_runs_at_once_make_each_artefact_once(uninterrupted, runs, tmp_path):
+    ids, _ = uninterrupted
+    store = tmp_path / "runs"
+    both = [runs.start(store, *REWARDS, "--jobs", "2", IRL_TEST_ROUND="0.1") for _ in range(2)]
+    for process in both:
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode == 0, errors
+    assert Store(store).ids() == ids
+    assert set(runs.computed().values()) == {1} and len(runs.computed()) == len(ids)
+
+
+def test_a_failed_step_stops_only_what_depends_on_it(runs, tmp_path):
+    store = tmp_path / "runs"
+    failing = "train_airl per-setting"
+    errors = runs.run(store, "--jobs", "2", "--until", "returns", code=1, IRL_TEST_FAIL=failing)
+    assert f"warning: {ROW}.irm.0 failed: " in errors and "it was asked to fail" in errors
+    assert "hint: do not ask for it" in errors
+    assert f"error: 1 of 13 steps failed: {ROW}.irm.0; 1 wait for them" in errors
+    made = set(Store(store).names())
+    assert f"{ROW}.erm.0.zero-shot-returns" in made and len(made) == 11
+    assert not made & {f"{ROW}.irm.0", f"{ROW}.irm.0.zero-shot-returns"}
+    before = len(runs.processes())
+    runs.run(store, "--until", "returns")
+    assert len(runs.processes()) == before + 2 and len(Store(store).names()) == 13
+
+
+def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs, tmp_path):
+    ids, _ = uninterrupted
+    store = tmp_path / "runs"
+    for count, slow in ((1, "0.3"), (2, "60")):
+        process = runs.start(store, *REWARDS, "--jobs", "2", IRL_TEST_ROUND=slow)
+        before = len([line for line in runs.lines() if "computes" in line])
+        while len([line for line in runs.lines() if "computes" in line]) <= before:
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(0.5)
+        for _ in range(count):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.3)
+        out, errors = process.communicate(timeout=30)
+        assert (process.returncode, out) == (130, "")
+        assert "error: stopped: " in errors and "same command again" in errors
+        if count == 1:
+            assert list(store.glob(".work/*/checkpoint"))
+    assert not _alive(line["pid"] for line in runs.lines())
+    runs.run(store, *REWARDS)
+    assert Store(store).ids() == ids
+
+
+def _alive(pids):
+    found = []
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, 0)
+            found.append(pid)
+    return found
+
+
+def test_lambda_is_chosen_before_the_reward_is_learned(irl, tmp_path, smoke_store):
+    """The reward's key is known only when the choice was made: its step still runs once."""
+    tables = tmp_path / "tables.toml"
+    tables.write_text(TABLES.replace('["erm", "irm"]', '["irm"]'))
+    small = ["--set", "airl.total_steps=1024", "--set", "evaluation.episodes=1"]
+    words = ["tiny", "--experiments", tables, "--profile", "smoke", *small, "--tag", "chosen"]
+    words += ["--choose-penalty", "1,10", "--store", tmp_path / "runs"]
+    name = "chosen.lunar-lander.engine-power.irm.0"
+    made = irl("run", *words, "--only", name, "--from", smoke_store.path, "--quiet")
+    assert made.code == 0, made.err
+    store = Store(tmp_path / "runs")
+    choice = store.resolve(f"{name}.choice").artefact
+    weight = json.loads((choice.directory / "choice.json").read_text())["chosen"]
+    learned = store.resolve(name).artefact.manifest.record
+    assert learned.parameters["airl"]["penalty_weight"] == weight
+    assert len(store.names()) == 13  # two experts, demos, four rewards and returns, choice, reward
+    planned = irl("plan", *words, "--until", "rewards", "--json")
+    assert json.loads(planned.out)["counts"]["HIT"] == 13
+
+
+def test_a_table_end_to_end(irl, smoke_store, tmp_path):
+    """Real stages: copied from another store where it has them, computed elsewhere, reported."""
+    tables, store = tmp_path / "tables.toml", tmp_path / "runs"
+    tables.write_text(TABLES.replace('["erm", "irm"]', '["irm"]'))
+    words = ["tiny", "--experiments", tables, "--profile", "smoke", "--store", store]
+    words += ["--from", smoke_store.path]
+    # In this process, which has loaded the libraries.
+    for step in ("random-returns", "idle-returns", "expert-returns", "expert.1x.reused-returns"):
+        made = irl("run", *words, "--only", f"{ROW}.{step}", "--quiet")
+        assert made.code == 0, made.err
+    done = irl("run", *words, "--jobs", "2", "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    events = {"RUN": [], "FOUND": [], "DONE": []}
+    for line in done.err.splitlines():
+        event, _, rest = line.partition(" ")
+        if f"{ROW}." in rest:
+            events[event].append(rest.removeprefix(f"{ROW}.").split()[0].rstrip(":"))
+    assert sorted(events["RUN"]) == ["expert.1.25x.reused-returns", "irm.0.zero-shot-returns"]
+    assert events["DONE"] == events["RUN"] or events["DONE"] == events["RUN"][::-1]
+    assert events["FOUND"] == ["expert.1.25x", "demos", "irm.0"]
+    assert "6 of 11 steps exist" in done.err and "(11 of 11)" in done.err
+    made = Store(store)
+    assert made.resolve(f"{ROW}.irm.0").artefact.id == smoke_store.airl
+    assert not made.verify(made.ids())
+    report = made.resolve("smoke.tiny").artefact
+    assert done.out.strip() == str(report.directory)
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"README.md", "tiny.csv", "tiny.png", "seeds.csv"} <= files
+    assert (tmp_path / "out" / "tiny.csv").stat().st_mode & 0o200
+    # The report is that of `irl report`, and a second run finds everything.
+    again = irl("report", *words)
+    assert again.out == done.out
+    second = irl("run", *words, "--jobs", "2")
+    assert second.out == done.out and "\nRUN" not in second.err
+    assert "11 of 11 steps exist" in second.err
