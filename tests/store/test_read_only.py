@@ -10,6 +10,7 @@ import pytest
 
 from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError
 from irlcli.store import Artefact, Peek, Store
+from irlcli.store.lock import locked
 
 DAMAGE = {
     "reward.pt is missing": lambda d: (d / "reward.pt").unlink(),
@@ -137,3 +138,12 @@ def test_a_read_only_store_refuses_every_change(empty_store, artefact, publish):
         with pytest.raises(UsageError, match="reading only"):
             change()
     assert tree(empty_store.root) == before
+
+
+def test_a_read_only_store_takes_no_lock(empty_store, artefact):
+    lock = empty_store.root / ".locks" / "gc"
+    with locked(lock), read_only(empty_store).in_use():
+        assert read_only(empty_store).find(artefact.manifest.record.key) == artefact
+    lock.unlink()
+    with read_only(empty_store).in_use():
+        assert not lock.exists()

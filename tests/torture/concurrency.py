@@ -15,10 +15,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from harness import HERE, SMOKE, Child, figures, irl, must, preload, seeded, warm_up
+
+if TYPE_CHECKING:
+    from irlcli.store import Artefact, KeyRecord, Scratch, Store
 
 KEYS = 6
 FILES = {"reward.pt": 40_000, "nested/table.parquet": 9_000}
@@ -28,10 +32,32 @@ def content(key: int, name: str) -> bytes:
     return bytes([key]) * FILES[name]
 
 
-def asker(root: Path, seed: int, rounds: int) -> None:
-    """Ask for one artefact after the other, as the runner does; make what is not there."""
+def compute(store: Store, record: KeyRecord, scratch: Scratch) -> Artefact:
+    output = scratch.new_output()
+    (output / "nested").mkdir()
+    for name in FILES:
+        (output / name).write_bytes(content(record.parameters["key"], name))
+    return store.publish(record, output, {"command": ["irl"]}).artefact
+
+
+def fill(root: Path, keys: Iterable[int]) -> None:
+    """A store to copy from."""
     from irlcli.store import KeyRecord, Store
 
+    store = Store(root)
+    store.create()
+    for key in keys:
+        record = KeyRecord("train-airl", 1, {"key": key}, {})
+        with store.working_on(record.key, wait=False) as scratch:
+            compute(store, record, scratch)
+
+
+def asker(root: Path, seed: int, rounds: int) -> None:
+    """Ask for one artefact after the other, as the runner does: find, copy or compute it."""
+    from irlcli.store import KeyRecord, Store
+    from irlcli.store.substitute import find_in, open_sources
+
+    sources = open_sources([root.parent / "zoo"], print)
     random = seeded()
     random.seed(seed)
     for _ in range(rounds):
@@ -44,11 +70,11 @@ def asker(root: Path, seed: int, rounds: int) -> None:
                 with store.working_on(record.key, wait=True) as scratch:
                     found = store.find(record.key)
                     if found is None:
-                        output = scratch.new_output()
-                        (output / "nested").mkdir()
-                        for name in FILES:
-                            (output / name).write_bytes(content(key, name))
-                        found = store.publish(record, output, {"command": ["irl"]}).artefact
+                        elsewhere = find_in(sources, record.key)
+                        if elsewhere is not None:
+                            found = store.adopt(*elsewhere).artefact
+                        else:
+                            found = compute(store, record, scratch)
                         with open(root.parent / "made", "a") as log:
                             log.write(f"{key}\n")
             for name in FILES:
@@ -58,6 +84,10 @@ def asker(root: Path, seed: int, rounds: int) -> None:
                 assert store.resolve(f"name-{key}/reward.pt").artefact == found
         # gc needs a moment in which nobody holds the store.
         time.sleep(random.expovariate(1 / 0.05))
+
+
+def contents(root: Path) -> list[tuple[str, int]]:
+    return sorted((str(path), path.lstat().st_mtime_ns) for path in root.rglob("*"))
 
 
 def until_told(work: Callable[[], None], root: Path) -> None:
@@ -123,6 +153,8 @@ def store_alone(work: Path, rounds: int) -> dict[str, int]:
 
     root = work / "runs"
     Store(root).create()
+    fill(work / "zoo", range(KEYS // 2))
+    before = contents(work / "zoo")
     others = [fork(lambda: collector(root)) for _ in range(2)]
     others += [fork(lambda: checker(root)) for _ in range(2)]
     askers = [fork(lambda seed=seed: asker(root, seed, rounds)) for seed in range(8)]
@@ -132,14 +164,15 @@ def store_alone(work: Path, rounds: int) -> dict[str, int]:
     made = Counter((work / "made").read_text().split())
     collected = Counter((work / "collected").read_text().split())
     for key, count in made.items():
-        # Made once, and once more for each time that it was collected.
+        # Made or copied once, and once more for each time that it was collected.
         assert count - collected[key] in (0, 1), (key, made, collected)
     store = Store(root)
     assert store.verify(store.ids()) == {}
     assert list((root / ".quarantine").iterdir()) == []
+    assert contents(work / "zoo") == before
     return {
         "requests": 8 * rounds,
-        "artefacts made": made.total(),
+        "artefacts made or copied": made.total(),
         "artefacts collected": collected.total(),
         "artefacts at the end": len(store.ids()),
     }

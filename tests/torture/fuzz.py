@@ -85,7 +85,7 @@ def settings_files(place: Path) -> Target:
     demo = Path(PACKAGE).parent / "settings" / "demo" / "lunar-lander.toml"
     seeds = [
         demo.read_bytes(),
-        b"[airl]\nmethod = 'irm'\n[airl.ppo]\nn_envs = 4",
+        b"[airl]\npenalty = 'irmv1'\n[airl.ppo]\nn_envs = 4",
         b"",
         b"a.b = [{}]",
     ]
@@ -107,23 +107,32 @@ def _publish(store, files: dict[str, bytes], stage: str = "train-airl"):
 def references(place: Path) -> Target:
     from irlcli.store import Store
 
-    store = Store(place / "runs")
-    artefact = _publish(store, {"reward.pt": b"x"})
-    store.set_name("best", artefact)
+    # One in the default place, and one elsewhere, in which runs/ID is found as well.
+    stores = [Store(place / name) for name in ("runs", "elsewhere")]
+    for store in stores:
+        artefact = _publish(store, {"reward.pt": b"x"})
+        store.set_name("best", artefact)
     os.chdir(place)
 
     def read(data: bytes) -> None:
-        # No argument of a process holds a zero byte.
+        # No argument of a process contains a zero byte.
         ref = data.replace(b"\0", b"").decode("utf-8", "surrogateescape")
-        found = store.resolve(ref)
-        if found.artefact is not None:
-            assert found.path.resolve().is_relative_to(artefact.directory.resolve())
+        for store in stores:
+            try:
+                found = store.resolve(ref)
+            except IrlError as error:
+                assert error.hint
+                continue
+            if found.artefact is not None:
+                inside = (store.root / artefact.id).resolve()
+                assert found.path.resolve().is_relative_to(inside)
 
     seeds = [
         b"best",
         b"best/reward.pt",
         artefact.id[:5].encode(),
         b"runs/best/reward.pt",
+        f"runs/{artefact.id[:4]}/reward.pt".encode(),
         b"./runs",
     ]
     return Target(seeds, read)

@@ -37,7 +37,10 @@ def test_killed_refused_and_with_another_clock():
 @needs_cc
 def test_many_processes_with_gc_and_verify_beside():
     found = short("concurrency")
-    assert found["requests"] == 800 and found["artefacts made"] >= found["artefacts at the end"]
+    assert (
+        found["requests"] == 800
+        and found["artefacts made or copied"] >= found["artefacts at the end"]
+    )
 
 
 def test_a_hit_does_not_grow_with_the_store():
