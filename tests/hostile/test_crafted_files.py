@@ -143,7 +143,7 @@ TOML = {
     "date": "[airl]\ntotal_steps = 1979-05-27",
     "escapes": '"\\u001b[2J\\nerror: x" = 1',
     "long name": "a" * 1990 + " = 1",
-    "long value": f"[airl]\nlearner = '{'b' * 1900}'",
+    "long value": f"[airl]\nactivation = '{'b' * 1900}'",
     "list for a table": "airl = [1]",
     "interventions": "[interventions]\nbounce = 3",
 }

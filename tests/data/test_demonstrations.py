@@ -19,7 +19,7 @@ from irlcli.data.demonstrations import (
 )
 from irlcli.errors import IntegrityError
 from irlcli.interventions import parse_settings
-from irlcli.trajectories import Trajectory, transitions
+from irlcli.trajectories import Trajectory
 
 SETTINGS = parse_settings("lunar-lander", "bounce=0.1,0.5")
 
@@ -210,45 +210,3 @@ def test_reading_starts_no_process(tmp_path, monkeypatch):
 def test_an_empty_dataset_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="no trajectory"):
         write_demonstrations(tmp_path, "lunar-lander", [(SETTINGS[0], [])], {})
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"observations": np.zeros((3, 2), np.float32)}, "need observations"),
-        ({"actions": np.zeros(5, np.int64)}, "need 3 actions"),
-        ({"rewards": np.zeros(0)}, "at least one step"),
-        ({"rewards": np.array([0.0, np.nan, 0.0])}, "rewards are not finite"),
-        ({"observations": np.zeros((4, 2))}, "float32"),
-        ({"actions": np.zeros(3, np.int32)}, "int64 or float32"),
-        ({"truncated": True}, "either terminated or truncated"),
-    ],
-)
-def test_trajectories_are_validated(changes, message):
-    fields = {
-        "observations": np.zeros((4, 2), np.float32),
-        "actions": np.zeros(3, np.int64),
-        "rewards": np.zeros(3),
-        "terminated": True,
-        "truncated": False,
-        "seed": 0,
-    }
-    with pytest.raises(ValueError, match=message):
-        Trajectory(**{**fields, **changes})
-
-
-def test_trajectories_are_frozen():
-    with pytest.raises(ValueError, match="read-only"):
-        make_trajectory(3).rewards[0] = 1.0
-
-
-def test_transitions_count_the_steps_left_of_the_horizon():
-    data = transitions([make_trajectory(4), make_trajectory(3, terminated=False)], horizon=10)
-    assert data.terminated.tolist() == [False] * 3 + [True] + [False] * 3
-    assert data.remaining.tolist() == [0, 0, 0, 6, 0, 0, 0]
-    first = make_trajectory(4)
-    np.testing.assert_array_equal(data.next_observations[:4], first.observations[1:])
-    with pytest.raises(ValueError, match="exceeds the horizon"):
-        transitions([make_trajectory(11)], horizon=10)
-    with pytest.raises(ValueError, match="at least one"):
-        transitions([], horizon=10)
