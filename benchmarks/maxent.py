@@ -98,8 +98,11 @@ def compare(imitation: str | None) -> None:
 
     arguments = (transitions, mdp.start, rewards[0], HORIZON)
     references.append(
-        ("dense solver", *best_of(5, lambda: dense_solve(*arguments)))
-        + (difference(*dense_solve(*arguments)),)
+        (
+            "dense solver",
+            *best_of(5, lambda: dense_solve(*arguments)),
+            difference(*dense_solve(*arguments)),
+        )
     )
     if imitation:
         with tempfile.TemporaryDirectory() as folder:
@@ -110,8 +113,12 @@ def compare(imitation: str | None) -> None:
             result = np.load(found)
             times = result["times"][1:]
             references.append(
-                ("imitation mce_irl", min(times), float(np.median(times)))
-                + (difference(result["policy"], result["states"]),)
+                (
+                    "imitation mce_irl",
+                    min(times),
+                    float(np.median(times)),
+                    difference(result["policy"], result["states"]),
+                )
             )
     print(f"{SIZE}x{SIZE} grid, horizon {HORIZON}: seconds of a backward and a forward pass")
     print(f"{'':32s}{'least':>10s}{'median':>10s}  ratios of the least times")
