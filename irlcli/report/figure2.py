@@ -101,18 +101,39 @@ weight. `irm-shuffled` deals the episodes out to the risks at random; every sett
 {markdown_table(*table(summarised, unseen))}"""
 
 
-def curves(quality: pd.DataFrame) -> dict[str, list[tuple[float, str]]]:
-    """(weight, variant) along each sweep, from weight 0: IRM by penalty, and the L2 of ERM."""
+@dataclass(frozen=True)
+class Curve:
+    """A sweep over one weight: (weight, variant) from weight 0, and how it is drawn."""
+
+    label: str
+    points: tuple[tuple[float, str], ...]
+    style: str  # of matplotlib, for example "o-"
+    colour: str
+
+
+def curves(quality: pd.DataFrame) -> list[Curve]:
+    """The L2 of ERM, and lambda of each penalty with true and with shuffled labels (dashed).
+
+    Without penalty both are ERM-balanced.
+    """
     rows = quality.drop_duplicates("variant")
-    balanced, irm, erm = (
-        rows[rows["grouping"] == grouping] for grouping in ("balanced", "per-setting", "pooled")
-    )
-    start = [(0.0, variant) for variant in balanced["variant"]]
-    points = {
-        f"IRM {penalty}": [*start, *zip(group["penalty_weight"], group["variant"], strict=True)]
-        for penalty, group in irm.groupby("penalty", sort=False)
-    }
-    return {**points, "ERM + L2": list(zip(erm["l2"], erm["variant"], strict=True))}
+    erm, balanced = (rows[rows["grouping"] == name] for name in ("pooled", "balanced"))
+    colours = iter(GROUP_COLOURS)
+    found = [Curve("ERM + L2", _points(erm["l2"], erm["variant"]), "^-", next(colours))]
+    for penalty, group in rows[rows["penalty"] != "none"].groupby("penalty", sort=False):
+        colour = next(colours)
+        for grouping, suffix, style in (
+            ("per-setting", "", "o-"),
+            ("shuffled", ", labels shuffled", "s--"),
+        ):
+            line = pd.concat([balanced, group[group["grouping"] == grouping]])
+            points = _points(line["penalty_weight"], line["variant"])
+            found.append(Curve(f"IRM {penalty}{suffix}", points, style, colour))
+    return found
+
+
+def _points(weights: pd.Series, variants: pd.Series) -> tuple[tuple[float, str], ...]:
+    return tuple(zip(weights.tolist(), variants, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +167,7 @@ def draw(
     maze: Maze,
     panels: Sequence[Panel],
     summarised: pd.DataFrame,
-    lines: Mapping[str, Sequence[tuple[float, str]]],
+    lines: Sequence[Curve],
     seed: int,
 ) -> None:
     """Write ``figure2.png`` and ``figure2.pdf``.
@@ -255,21 +276,20 @@ def _draw_curves(figure, places, summarised, lines, unseen: Sequence[str]) -> No
     what.append(("log-likelihood, worst trained setting [nats]", "log_likelihood", "worst"))
     for k, (title, measure, setting) in enumerate(what):
         axis = figure.add_subplot(places[k])
-        for colour, marker, (label, points) in zip(
-            GROUP_COLOURS, "os^", lines.items(), strict=False
-        ):
-            weights = [weight for weight, _ in points]
-            rows = cells.loc[[(variant, measure, setting) for _, variant in points]]
-            axis.fill_between(weights, rows["low"], rows["high"], color=colour, alpha=0.2, lw=0)
-            axis.plot(weights, rows["mean"], marker=marker, color=colour, label=label)
+        for line in lines:
+            weights = [weight for weight, _ in line.points]
+            rows = cells.loc[[(variant, measure, setting) for _, variant in line.points]]
+            band = {"color": line.colour, "alpha": 0.15, "lw": 0}
+            axis.fill_between(weights, rows["low"], rows["high"], **band)
+            axis.plot(weights, rows["mean"], line.style, color=line.colour, label=line.label)
         axis.set_xscale("symlog", linthresh=1e-3)
         axis.set_xlim(left=-1e-4)
         axis.set(title=title, xlabel="$\\lambda$ of IRM (0: ERM-balanced), or L2 of ERM (0: ERM)")
         axis.grid(alpha=0.3)
         if measure == "goal_probability":
             axis.set_ylim(-0.03, 1.03)
-        if k == 0:
-            axis.legend(fontsize=8)
+        if measure == "log_likelihood":
+            axis.legend(fontsize=8, loc="lower right")
 
 
 def _draw_table(axis, summarised: pd.DataFrame, unseen: Sequence[str]) -> None:

@@ -45,13 +45,19 @@ def test_table_has_a_row_per_variant():
     ]
 
 
-def test_curves_start_at_weight_zero_and_omit_the_control():
+def test_curves_start_at_weight_zero_with_the_control_beside_the_method():
     rows = quality("erm", "a", True, [1.0]) + quality("erm l2 0.1", "a", True, [1.0], l2=0.1)
     rows += quality("erm-balanced", "a", True, [1.0], grouping="balanced")
     for grouping, variant in (("per-setting", "irm"), ("shuffled", "irm-shuffled")):
         penalised = {"grouping": grouping, "penalty": "closed-form", "penalty_weight": 0.05}
         rows += quality(f"{variant} closed-form 0.05", "a", True, [1.0], **penalised)
-    assert curves(pd.DataFrame(rows)) == {
-        "IRM closed-form": [(0.0, "erm-balanced"), (0.05, "irm closed-form 0.05")],
-        "ERM + L2": [(0.0, "erm"), (0.1, "erm l2 0.1")],
+    found = curves(pd.DataFrame(rows))
+    assert {curve.label: curve.points for curve in found} == {
+        "ERM + L2": ((0.0, "erm"), (0.1, "erm l2 0.1")),
+        "IRM closed-form": ((0.0, "erm-balanced"), (0.05, "irm closed-form 0.05")),
+        "IRM closed-form, labels shuffled": (
+            (0.0, "erm-balanced"),
+            (0.05, "irm-shuffled closed-form 0.05"),
+        ),
     }
+    assert found[1].colour == found[2].colour != found[0].colour
