@@ -12,7 +12,7 @@ from irlcli.interventions import Setting, parse_setting
 from irlcli.stages import train_expert
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key, shown
 
-# Episodes become Python objects when a dataset is read; see dataset.py.
+# Every episode is validated on its own when demonstrations are read.
 _MOST_EPISODES = 100_000
 
 
