@@ -132,7 +132,7 @@ class StageSession(Session):
 
         sources = []
         if self.sources:
-            from irlcli.store.substitute import open_sources
+            from irlcli.store.sources import open_sources
 
             sources = open_sources(self.sources, self.console.warn)
         return Runner(

@@ -176,7 +176,7 @@ class Runner:
         """A verified copy of the artefact, and the source that has it; None if none has."""
         if not self.sources:
             return None
-        from irlcli.store.substitute import find_in
+        from irlcli.store.sources import find_in
 
         found = find_in(self.sources, record.key)
         if found is None:

@@ -113,7 +113,7 @@ class Lookup:
             return Step("RUN", label, f"{there.problem}: it would be computed again", key=key)
         if self._sources:
             # A hit in a store without sources does not load it.
-            from irlcli.store.substitute import find_in
+            from irlcli.store.sources import find_in
 
             found = find_in(self._sources, key)
             if found is not None:

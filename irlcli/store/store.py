@@ -11,7 +11,6 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +53,7 @@ class Store:
         read_only: bool = False,
     ):
         self.warn = warn
+        self._index: Index | None = None
         self._layout = Layout(Path(root), read_only)
         layouts.check(self._layout)
 
@@ -186,15 +186,16 @@ class Store:
         """
         from irlcli.store.substitute import adopt, ancestors
 
-        before = ancestors(artefact, other._manifests) if artefact.manifest.record.inputs else []
+        before = ancestors(artefact, other._manifests(artefact.id))
         return adopt(self._writable, other._layout, artefact, before, self.warn)
 
-    @cached_property
-    def _manifests(self) -> Index:
-        """What this store has, read once: artefacts it gains later are not needed as ancestors."""
+    def _manifests(self, id16: str) -> Index:
+        """The sound manifests, read once: again only for an artefact that is newer than that."""
         from irlcli.store.substitute import sound_manifests
 
-        return sound_manifests(self._layout, self.warn)
+        if self._index is None or id16 not in self._index.artefacts:
+            self._index = sound_manifests(self._layout, self.warn)
+        return self._index
 
     # Integrity
 

@@ -1,18 +1,17 @@
-"""Copying artefacts from other stores instead of computing them.
+"""Copying an artefact and its ancestors from another store, every byte verified.
 
-The other stores are only read: nothing is locked, moved or repaired there. A damaged artefact
-there is reported and treated as missing.
+The other store is only read: nothing is locked, moved or repaired there. A damaged artefact there
+is reported and treated as missing.
 """
 
 from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
-from irlcli.errors import IntegrityError, NewerFormat, NotFound
+from irlcli.errors import IntegrityError
 from irlcli.store.artefact import Artefact, Published, read_artefact
 from irlcli.store.durable import unique_name
 from irlcli.store.index import Index
@@ -23,55 +22,8 @@ from irlcli.store.publish import place_and_claim
 from irlcli.store.read import held_by, ids
 from irlcli.store.scratch import Scratch
 
-if TYPE_CHECKING:
-    from irlcli.store.store import Store
-
 Warn = Callable[[str], None]
 _CHUNK = 1 << 20
-
-
-class Found(NamedTuple):
-    """An artefact, and the other store that has it."""
-
-    store: Store
-    artefact: Artefact
-
-
-def open_sources(directories: Iterable[Path | str], warn: Warn) -> list[Store]:
-    """The stores in ``directories``, for reading only.
-
-    Raises:
-        NotFound: a directory is not a store.
-        IntegrityError: a directory holds a newer store, or a damaged one.
-        UsageError: a path is not a directory.
-    """
-    from irlcli.store.store import Store
-
-    stores = []
-    for directory in directories:
-        store = Store(directory, warn, read_only=True)
-        if not store.exists():
-            raise NotFound(f"{directory} is not a store", "name a store with --from or IRL_FROM")
-        stores.append(store)
-    return stores
-
-
-def find_in(stores: Sequence[Store], key: str) -> Found | None:
-    """The artefact of ``key`` in the first of ``stores`` that has it; None if none has.
-
-    Checks the manifest and the sizes; hashes nothing. An artefact that is damaged or of a newer
-    schema is skipped with a warning.
-    """
-    for store in stores:
-        try:
-            artefact, problem = store.peek(key)
-        except NewerFormat as error:
-            artefact, problem = None, f"{error.message}; {error.hint}"
-        if artefact is not None:
-            return Found(store, artefact)
-        if problem is not None:
-            store.warn(f"not copying from the store {store.root}: {problem}")
-    return None
 
 
 def sound_manifests(layout: Layout, warn: Warn) -> Index:

@@ -18,7 +18,7 @@ from every_step import ENOUGH, counter, in_child, intercept, kill_self
 
 from irlcli.errors import IntegrityError, NotFound, UsageError
 from irlcli.store import Artefact, Store
-from irlcli.store.substitute import find_in, open_sources
+from irlcli.store.sources import find_in, open_sources
 
 FILES = {"f": b"content", "nested/g": b"PAR1" * 64}
 
@@ -139,6 +139,22 @@ def test_ancestors_that_the_other_store_lacks_are_left_out(store, zoo):
     shutil.rmtree(zoo["expert"].directory)
     adopt(store, zoo)
     assert set(store.ids()) == {zoo["demos"].id, zoo["airl"].id}
+
+
+def test_ancestors_that_the_other_store_gains_while_it_is_open_are_copied(tmp_path, store, publish):
+    """Somebody else may be working in it."""
+    other = Store(tmp_path / "other")
+
+    def chain(seed: int) -> Artefact:
+        parent = publish(other, {"f": b"parent %d" % seed}, parameters={"of": seed}).artefact
+        inputs = {"reward": parent.output("f").sha256}
+        return publish(other, {"f": b"%d" % seed}, parameters={"of": seed}, inputs=inputs).artefact
+
+    first = chain(1)
+    (source,) = open_sources([other.root], pytest.fail)
+    store.adopt(source, first)
+    store.adopt(source, chain(2))
+    assert set(store.ids()) == set(other.ids()) and len(store.ids()) == 4
 
 
 def test_ancestors_whose_content_leads_back_are_copied_once(store, tmp_path, publish):

@@ -55,7 +55,7 @@ def fill(root: Path, keys: Iterable[int]) -> None:
 def asker(root: Path, seed: int, rounds: int) -> None:
     """Ask for one artefact after the other, as the runner does: find, copy or compute it."""
     from irlcli.store import KeyRecord, Store
-    from irlcli.store.substitute import find_in, open_sources
+    from irlcli.store.sources import find_in, open_sources
 
     sources = open_sources([root.parent / "zoo"], print)
     random = seeded()
