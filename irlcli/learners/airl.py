@@ -354,18 +354,15 @@ class AIRL:
         self, current: Sequence[Pool], expert: Sequence[Pool], policy: Policy
     ) -> list[list[Stratum]]:
         """What each risk's minibatch is drawn from. Every method draws as many samples."""
-        past = []
-        for setting in range(self._settings):
-            replayed = self._replay.transitions(setting)
-            past.append(None if replayed is None else self._pool(replayed, policy))
+        # Every round adds to every setting, so all of them have a past or none has.
+        past = [self._pool(data, policy) for data in self._replay.transitions()]
         size = self.config.batch_size * self._settings // len(self._groups)
 
-        def paired(pools: Sequence[Pool | None], part: Part) -> Pool | None:
+        def paired(pools: Sequence[Pool], part: Part) -> list[Pool]:
             """The policy's pools that go with ``part``: of the same settings, or of all."""
-            if self.config.pairing == "matched":
-                pools = [pools[setting] for setting in part.episodes]
-            found = [pool for pool in pools if pool is not None]
-            return (found[0] if len(found) == 1 else join_pools(found)) if found else None
+            if self.config.pairing == "pooled":
+                return list(pools)
+            return [pools[setting] for setting in part.episodes]
 
         def demonstrated(setting: int, episodes: np.ndarray) -> Pool:
             own = self._demonstrations[setting]
@@ -375,19 +372,15 @@ class AIRL:
 
         def strata(members: Group) -> list[Stratum]:
             counts = apportion(size, [part.share for part in members.parts])
-            found = []
-            for part, count in zip(members.parts, counts, strict=True):
-                experts = [demonstrated(e, episodes) for e, episodes in part.episodes.items()]
-                generated, earlier = paired(current, part), paired(past, part)
-                found.append(
-                    Stratum(
-                        policy=generated,
-                        expert=experts[0] if len(experts) == 1 else join_pools(experts),
-                        past=() if earlier is None else (earlier,),
-                        count=count,
-                    )
+            return [
+                Stratum(
+                    policy=join_pools(paired(current, part)),
+                    expert=join_pools([demonstrated(e, i) for e, i in part.episodes.items()]),
+                    past=(join_pools(paired(past, part)),) if past else (),
+                    count=count,
                 )
-            return found
+                for part, count in zip(members.parts, counts, strict=True)
+            ]
 
         return [strata(members) for members in self._groups]
 

@@ -57,10 +57,13 @@ def make_pool(
 
 def join_pools(pools: Sequence[Pool]) -> Pool:
     """One pool of several, each row drawn as often as before."""
+    if len(pools) == 1:
+        return pools[0]
     offsets = np.cumsum([0] + [len(pool.observations) for pool in pools[:-1]])
     draw = torch.cat([pool.draw + int(o) for pool, o in zip(pools, offsets, strict=True)])
-    rows = (torch.cat([getattr(pool, f.name) for pool in pools]) for f in fields(Pool)[:-1])
-    return Pool(*rows, draw)
+    names = [f.name for f in fields(Pool) if f.name != "draw"]
+    rows = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in names}
+    return Pool(**rows, draw=draw)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,9 @@ class Replay:
         self._capacity = capacity
         self._episodes: list[list[Transitions]] = [[] for _ in range(settings)]
 
-    def add(self, setting: int, data: Transitions, episodes: np.ndarray, rng) -> None:
+    def add(
+        self, setting: int, data: Transitions, episodes: np.ndarray, rng: np.random.Generator
+    ) -> None:
         """Add some of the episodes of ``data`` [B], numbered by ``episodes`` [B]."""
         kept = self._episodes[setting]
         numbers = np.unique(episodes)
@@ -69,10 +71,9 @@ class Replay:
             survivors = np.sort(rng.choice(len(kept), self._capacity, replace=False))
             self._episodes[setting] = [kept[i] for i in survivors]
 
-    def transitions(self, setting: int) -> Transitions | None:
-        """All of a setting's episodes, one after the other; None before the first round."""
-        episodes = self._episodes[setting]
-        return join(episodes) if episodes else None
+    def transitions(self) -> list[Transitions]:
+        """Each setting's episodes, one after the other; empty before the first round."""
+        return [join(episodes) for episodes in self._episodes if episodes]
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed run needs: per setting, joined episodes and their lengths."""
@@ -90,17 +91,14 @@ class Replay:
         """Continue from ``state_dict()``."""
         self._episodes = []
         for stored in state["settings"]:
-            tensors = {name: t.numpy() for name, t in stored.items() if name != "lengths"}
             ends = np.cumsum(stored["lengths"].numpy())
-            joined = Transitions(**tensors) if len(ends) else None
-            starts = [0, *ends[:-1]]
-            self._episodes.append(
-                [
-                    joined.take(np.arange(start, end))
-                    for start, end in zip(starts, ends, strict=False)
-                    if joined is not None
-                ]
-            )
+            rows = [np.arange(end - n, end) for n, end in zip(stored["lengths"], ends, strict=True)]
+            if not rows:
+                self._episodes.append([])
+                continue
+            tensors = {name: t.numpy() for name, t in stored.items() if name != "lengths"}
+            joined = Transitions(**tensors)
+            self._episodes.append([joined.take(own) for own in rows])
 
 
 def _tensors(data: Transitions) -> dict[str, torch.Tensor]:

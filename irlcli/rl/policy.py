@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import torch
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
@@ -14,6 +15,7 @@ from irlcli.envs.registration import make
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting
 from irlcli.networks import ACTIVATIONS, ObservationNormaliser
+from irlcli.rl.worlds import observation_size
 
 # Categorical re-checks its support on every one of millions of calls. SB3 builds it from logits
 # that are finite, or the run has failed already.
@@ -50,8 +52,8 @@ class Policy:
     def act(self, observations: np.ndarray, deterministic: bool = False) -> np.ndarray:
         """Actions [N] or [N, A] for observations [N, D]; samples by torch's global generator."""
         with torch.no_grad():
-            distribution = self.network.get_distribution(torch.as_tensor(observations))
-            actions = distribution.mode() if deterministic else distribution.distribution.sample()
+            found = self.network.get_distribution(torch.as_tensor(observations))
+            actions = found.mode() if deterministic else _torch_distribution(found).sample()
             return actions.numpy()
 
     def log_prob(
@@ -66,8 +68,8 @@ class Policy:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and standard deviation [B, A] of pi(.|s) for observations [B, D]."""
         with torch.set_grad_enabled(gradient):
-            distribution = self.network.get_distribution(observations).distribution
-            return distribution.mean, distribution.stddev
+            found = _torch_distribution(self.network.get_distribution(observations))
+            return found.mean, found.stddev
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The network's tensors."""
@@ -76,6 +78,12 @@ class Policy:
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Replace the network's tensors."""
         self.network.load_state_dict(state)
+
+
+def _torch_distribution(found: Distribution) -> torch.distributions.Distribution:
+    """Torch's distribution inside SB3's: its samples need no gSDE noise matrix."""
+    assert isinstance(found.distribution, torch.distributions.Distribution)
+    return found.distribution
 
 
 def describe(ppo: PPOConfig) -> PolicyNetwork:
@@ -123,10 +131,11 @@ def require_observations(policy: Policy, space: gymnasium.Space, where: str) -> 
     Raises:
         UsageError: their sizes differ.
     """
-    size = policy.network.observation_space.shape[0]
-    if space.shape[0] != size:
+    size = observation_size(policy.network.observation_space)
+    if observation_size(space) != size:
         raise UsageError(
-            f"the policy takes observations of size {size}, but {where} has size {space.shape[0]}",
+            f"the policy takes observations of size {size}, but {where} has size "
+            f"{observation_size(space)}",
             "a goal (goal-y, direction) is part of the observation: name a setting with the same "
             "kind of intervention as in training",
         )

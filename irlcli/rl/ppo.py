@@ -22,7 +22,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from irlcli.configs import PPOConfig
 from irlcli.errors import StageFailed
 from irlcli.networks import ACTIVATIONS, CLIP
-from irlcli.rl.policy import Policy, extractor
+from irlcli.rl.policy import NormalisingExtractor, Policy, extractor
 from irlcli.rl.worlds import RecordingVecEnv, Worlds
 from irlcli.seeds import derive
 from irlcli.trajectories import Rollout
@@ -168,8 +168,9 @@ class PPOTrainer:
     def observe(self, observations: np.ndarray) -> None:
         """Merge ``observations`` [B, D] into the policy's moments, if it normalises by them."""
         if self.ppo.normalise_observations:
-            normaliser = self.model.policy.features_extractor.normaliser
-            normaliser.update(torch.as_tensor(observations))
+            extractor = self.model.policy.features_extractor
+            assert isinstance(extractor, NormalisingExtractor)
+            extractor.normaliser.update(torch.as_tensor(observations))
 
     def cap_noise(self) -> None:
         """Keep the policy's log standard deviation at or below ``ppo.log_std_max``."""
@@ -184,7 +185,7 @@ class PPOTrainer:
         shape = (model.n_steps, self._venv.num_envs)
         # SB3 flattens the buffer's arrays in place when it trains: these are copies.
         observations = buffer.observations.copy()
-        next_observations = np.concatenate([observations[1:], model._last_obs[None]])
+        next_observations = np.concatenate([observations[1:], self._last_observations[None]])
         terminated, truncated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         lengths, returns = np.zeros(shape, dtype=np.int64), np.zeros(shape)
         progress = np.full(shape, np.nan)
@@ -212,6 +213,11 @@ class PPOTrainer:
             errors=tuple((end.world, end.error) for _, end in self._venv.ended if end.error),
         )
 
+    @property
+    def _last_observations(self) -> np.ndarray:
+        """[N, D], where SB3's next rollout begins."""
+        return np.asarray(self.model._last_obs)
+
     def _set_rewards(self, rollout: Rollout, rewards: np.ndarray) -> None:
         """Let SB3's buffer hold ``rewards`` [T, N] and the advantages that follow from them."""
         if rewards is rollout.true_rewards and not self.ppo.normalise_rewards:
@@ -226,9 +232,10 @@ class PPOTrainer:
                 final = torch.as_tensor(rollout.next_observations[rollout.truncated])
                 values = model.policy.predict_values(final)[:, 0].numpy()
                 rewards[rollout.truncated] += model.gamma * values
-            last_values = model.policy.predict_values(torch.as_tensor(model._last_obs))
+            last_values = model.policy.predict_values(torch.as_tensor(self._last_observations))
         buffer.rewards[:] = rewards
-        buffer.compute_returns_and_advantage(last_values, model._last_episode_starts)
+        starts = np.asarray(model._last_episode_starts)
+        buffer.compute_returns_and_advantage(last_values, starts)
 
     def _normalised(self, rewards: np.ndarray, rollout: Rollout) -> np.ndarray:
         """``rewards`` [T, N] over the deviation of their discounted sums, this rollout included."""

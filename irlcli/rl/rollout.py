@@ -105,10 +105,12 @@ def _action_dtype(space: gymnasium.Space) -> type:
 def _random_actions(space: gymnasium.Space, count: int, rng: np.random.Generator) -> np.ndarray:
     if isinstance(space, gymnasium.spaces.Discrete):
         return rng.integers(space.n, size=count)
+    assert isinstance(space, gymnasium.spaces.Box)
     return rng.uniform(space.low, space.high, size=(count, *space.shape)).astype(np.float32)
 
 
 def _idle_actions(space: gymnasium.Space, count: int) -> np.ndarray:
     if isinstance(space, gymnasium.spaces.Discrete):
         return np.zeros(count, dtype=np.int64)
+    assert isinstance(space, gymnasium.spaces.Box)
     return np.zeros((count, *space.shape), dtype=np.float32)

@@ -39,7 +39,14 @@ def action_space(space: gymnasium.Space) -> ActionSpace:
     """What learners need to know of ``space``."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return ActionSpace(True, int(space.n), np.empty(0), np.empty(0))
+    assert isinstance(space, gymnasium.spaces.Box)
     return ActionSpace(False, space.shape[0], space.low, space.high)
+
+
+def observation_size(space: gymnasium.Space) -> int:
+    """The length D of an observation vector of ``space``."""
+    assert isinstance(space, gymnasium.spaces.Box)
+    return space.shape[0]
 
 
 class RecordingVecEnv(VecEnv):
@@ -51,7 +58,7 @@ class RecordingVecEnv(VecEnv):
         self.seeds: Sequence[int] = range(len(worlds))
         self.rewards: list[np.ndarray] = []
         self.ended: list[tuple[int, Ended]] = []
-        self._actions: np.ndarray | None = None
+        self._actions = np.empty(0)
         self._no_infos: list[dict[str, Any]] = [{} for _ in range(len(worlds))]
 
     def start_recording(self) -> None:

@@ -67,7 +67,7 @@ def request(
         )
     texts = tuple(str(s) for s in settings)
     label = f"collect-experts {env} {', '.join(texts)} seed {seed}"
-    shared = {
+    shared: dict[str, Any] = {
         "environment": environment_key(env),
         "settings": texts,
         "episodes": counts,

@@ -1,8 +1,10 @@
 """Returns of a policy over whole episodes: true, and by a learned reward if one is given."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from contextlib import closing
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
@@ -19,6 +21,9 @@ from irlcli.stages.base import (
     environment_key,
     shown,
 )
+
+if TYPE_CHECKING:
+    from irlcli.rl.policy import Policy
 
 Agent = Literal["policy", "random", "idle"]
 
@@ -59,10 +64,8 @@ def request(
             f"agent {agent!r} {'needs a' if policy is None else 'takes no'} policy",
             "give a policy, or name the random or the idle agent",
         )
-    if agent == "random":
-        # Its actions are random either way.
-        evaluation = msgspec.structs.replace(evaluation, deterministic=False)
-    if agent == "idle":
+    if agent != "policy":
+        # The random and the idle agent act alike either way.
         evaluation = msgspec.structs.replace(evaluation, deterministic=False)
     texts = tuple(str(s) for s in settings)
     parameters = Parameters(
@@ -72,8 +75,11 @@ def request(
         seed=seed,
         evaluation=evaluation,
     )
-    inputs = {"policy": policy, "reward": reward}
-    inputs = {role: source for role, source in inputs.items() if source is not None}
+    inputs = {
+        role: source
+        for role, source in (("policy", policy), ("reward", reward))
+        if source is not None
+    }
     label = f"evaluate {policy_label or agent} in {env} {', '.join(texts)} seed {seed}"
     label += f" by the reward of {reward_label}" if reward is not None else ""
     return Request(STAGE, parameters, inputs, label)
@@ -84,17 +90,18 @@ def run(job: Job) -> None:
     import numpy as np
     import pyarrow as pa
 
-    from irlcli.data.parquet import write_table
     from irlcli.data.outputs import write_json
+    from irlcli.data.parquet import write_table
     from irlcli.data.tensors import load_policy_file, load_reward_file
     from irlcli.envs.registration import make
     from irlcli.learners.frozen import FrozenReward
     from irlcli.rl.rollout import roll_out
-    from irlcli.rl.worlds import action_space
+    from irlcli.rl.worlds import action_space, observation_size
 
     p: Parameters = job.parameters
     env = p.environment.name
-    policy, subject = p.agent, {"agent": p.agent, "env": env}
+    policy: Policy | str = p.agent
+    subject: dict[str, Any] = {"agent": p.agent, "env": env}
     if "policy" in job.inputs:
         policy, origin = load_policy_file(job.inputs["policy"])
         subject = msgspec.to_builtins(origin)
@@ -117,7 +124,7 @@ def run(job: Job) -> None:
                     horizon=p.environment.max_episode_steps,
                     gamma=learned.network.gamma,
                     where=f"{env} {text}",
-                    observation_size=world.observation_space.shape[0],
+                    observation_size=observation_size(world.observation_space),
                     actions=action_space(world.action_space),
                 )
         trajectories = roll_out(

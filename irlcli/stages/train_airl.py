@@ -1,7 +1,10 @@
 """Adversarial IRL from demonstrations (paper Algorithm 1), with any grouping and penalty."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -21,6 +24,9 @@ from irlcli.stages.base import (
     environment_key,
     run_training,
 )
+
+if TYPE_CHECKING:
+    from irlcli.trajectories import Trajectory
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,7 +129,7 @@ def run(job: Job) -> None:
     from irlcli.rl.loop import LastRound, Training
     from irlcli.rl.ppo import PPOTrainer, rounds
     from irlcli.rl.rollout import roll_out
-    from irlcli.rl.worlds import action_space, make_worlds
+    from irlcli.rl.worlds import action_space, make_worlds, observation_size
 
     p: Parameters = job.parameters
     env, airl = p.environment.name, p.airl
@@ -134,11 +140,12 @@ def run(job: Job) -> None:
             f"{env} {', '.join(p.settings)} is asked for"
         )
     settings = _trained(airl, p.settings)
-    episodes = [demos.trajectories[text] for text in settings]
-    held_out = []
+    episodes: list[Sequence[Trajectory]] = [demos.trajectories[text] for text in settings]
+    held_out: list[Sequence[Trajectory]] = []
     if airl.select == "episodes":
         try:
-            episodes, held_out = zip(*map(hold_out, episodes), strict=True)
+            parts = [hold_out(group) for group in episodes]
+            episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
         except ValueError as error:
             raise UsageError(str(error), "select by a setting, or record more episodes") from None
     parsed = [parse_setting(env, text) for text in settings]
@@ -152,7 +159,7 @@ def run(job: Job) -> None:
                 airl,
                 worlds=len(worlds),
                 horizon=p.environment.max_episode_steps,
-                observation_size=worlds.observation_space.shape[0],
+                observation_size=observation_size(worlds.observation_space),
                 actions=action_space(worlds.action_space),
                 seed=p.seed,
             )
@@ -168,7 +175,7 @@ def run(job: Job) -> None:
             found = roll_out(env, where, policy, airl.select_episodes, p.seed, "selection")
             return float(np.mean([t.episode_return for t in found]))
 
-        selector = LastRound()
+        selector: LastRound | BestRound = LastRound()
         if airl.select != "last":
             score = likelihood if airl.select == "episodes" else true_return
             total = rounds(airl.ppo, airl.total_steps)

@@ -65,7 +65,7 @@ def run(job: Job) -> None:
     from irlcli.learners.frozen import FrozenReward
     from irlcli.rl import algorithm
     from irlcli.rl.loop import LastRound, NoLearner, Training
-    from irlcli.rl.worlds import action_space, make_worlds
+    from irlcli.rl.worlds import action_space, make_worlds, observation_size
 
     p: Parameters = job.parameters
     env, ppo = p.environment.name, p.transfer.ppo
@@ -78,7 +78,7 @@ def run(job: Job) -> None:
             horizon=p.environment.max_episode_steps,
             gamma=ppo.gamma,
             where=f"{env} {p.setting}",
-            observation_size=worlds.observation_space.shape[0],
+            observation_size=observation_size(worlds.observation_space),
             actions=action_space(worlds.action_space),
         )
         trainer = algorithm(p.transfer.algorithm)(

@@ -100,7 +100,7 @@ def test_every_episode_is_as_likely_to_be_replayed_whatever_its_length():
         replay = Replay(1, per_round=2, capacity=10)
         data, numbers = joined([episode(2, 1.0), episode(10, 2.0), episode(9, 2.0)])
         replay.add(0, data, numbers, np.random.default_rng(seed))
-        kept = replay.transitions(0)
+        kept = replay.transitions()[0]
         pool = make_pool(model, kept, torch.zeros(len(kept)), absorbing=True)
         # Two whole episodes of the horizon's 10 steps, absorbing ones included.
         assert len(pool.draw) == 20
@@ -114,10 +114,10 @@ def test_replay_keeps_whole_episodes_within_its_capacity():
     for index in range(5):
         data, numbers = joined([episode(k + 2, 10 * index + k) for k in range(4)])
         replay.add(0, data, numbers, rng)
-    kept = replay.transitions(0)
+    kept = replay.transitions()[0]
     assert kept.terminated.sum() == 4
     assert kept.remaining.sum() + len(kept) == 4 * 10
-    assert replay.transitions(1) is None
+    assert len(replay.transitions()) == 1
 
 
 def test_a_resumed_replay_is_the_same():
@@ -126,10 +126,8 @@ def test_a_resumed_replay_is_the_same():
     replay.add(1, data, numbers, np.random.default_rng(0))
     again.load_state_dict(from_bytes(to_bytes(replay.state_dict())))
     assert to_bytes(again.state_dict()) == to_bytes(replay.state_dict())
-    assert again.transitions(0) is None
-    np.testing.assert_array_equal(
-        again.transitions(1).observations, replay.transitions(1).observations
-    )
+    ((kept,), (expected,)) = again.transitions(), replay.transitions()
+    np.testing.assert_array_equal(kept.observations, expected.observations)
     for one in (replay, again):
         one.add(1, data, numbers, np.random.default_rng(1))
         one.add(1, data, numbers, np.random.default_rng(2))
@@ -140,4 +138,4 @@ def test_no_replay_is_kept_where_none_is_drawn():
     demos = random_episodes(2)
     trainer, learner = make(demos, CONFIG, replay_share=0.0)
     learner.update(0, trainer.train_round(0, learner), trainer.policy)
-    assert learner._replay.transitions(0) is None
+    assert learner._replay.transitions() == []
