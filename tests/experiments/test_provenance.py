@@ -1,11 +1,12 @@
-"""Attempts, versions and code state: what a result and a checkpoint say of where they come from."""
+"""Provenance of results and checkpoints: attempts, library versions, code state."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import time
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
@@ -14,8 +15,7 @@ import torch
 from irlcli.data import tensors as checkpoints
 from irlcli.experiments import provenance
 from irlcli.experiments.runner import Runner, Silent
-from irlcli.rl.loop import _state
-from irlcli.stages.base import Job, Request, Stage
+from irlcli.stages.base import Job, Request, Stage, run_training
 from irlcli.store import Store
 
 ROUNDS = 4
@@ -128,6 +128,8 @@ def test_other_libraries_start_over_and_say_so(tmp_path, monkeypatch, name, now,
         ({"stage_version": 7}, "count 7 wrote it"),
         ({"attempts": [{"started": 1}]}, "not readable"),
         ({"libraries": {}}, "written with"),
+        ({"libraries": {"x" * 9999: "1"}}, "written with"),
+        ({"stage": "x" * 9999}, "wrote it"),
         (None, "not readable"),
     ],
 )
@@ -146,6 +148,17 @@ def test_headers_that_cannot_be_used(tmp_path, change, named):
     artefact, warnings = attempt(tmp_path, counting())
     assert (artefact.directory / "count").read_bytes() == b"0"
     assert len(warnings) == 1 and named in warnings[0] and "starting over" in warnings[0]
+    assert len(warnings[0]) < 500
+
+
+def test_a_deeply_nested_header_is_refused(tmp_path):
+    die(tmp_path, 2)
+    (path,) = tmp_path.glob(".work/*/checkpoint")
+    with Store(tmp_path).working_on(path.parent.name, wait=False) as scratch:
+        head = b'{"schema": 1, "x": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+        scratch.save(len(head).to_bytes(4, "big") + head)
+    _, (warning,) = attempt(tmp_path, counting())
+    assert "not readable" in warning
 
 
 def test_code_that_is_not_committed_counts_new_files_too(tmp_path):
@@ -175,23 +188,52 @@ def test_code_that_is_not_committed_counts_new_files_too(tmp_path):
     assert None not in states and len(set(states)) == 4
 
 
-class Trainer:
-    """As much of a trainer as a checkpoint asks for."""
+class LongTraining:
+    """As much of a training as :func:`run_training` asks for: the metrics of very many rounds."""
+
+    ROW: ClassVar[dict] = {
+        "round": 10**6,
+        "setting": "mass=0.5x",
+        "true_return": 1 / 3,
+        "progress": float("nan"),
+    }
+
+    def __init__(self, rows: int):
+        self.rows = [self.ROW] * rows
+        self.trainer = SimpleNamespace(steps=1, rounds=1, steps_per_round=1)
 
     def state_dict(self) -> dict[str, Any]:
         return {"steps": 1}
 
+    def load_state_dict(self, state: dict[str, Any], rows: list[dict]) -> None:
+        assert state == {"steps": 1}
+        self.rows = rows
 
-def test_the_metrics_of_a_long_run_fit_into_its_checkpoint():
+    def run(self, after_round, warn) -> list[dict]:
+        after_round(self, self.rows[-1:])
+        return self.rows
+
+
+class Saved:
+    """Checkpoints in memory."""
+
+    data: bytes | None = None
+
+    def load(self) -> bytes | None:
+        return self.data
+
+    def offer(self, state) -> None:
+        self.data = state()
+
+
+def test_the_metrics_of_a_long_run_fit_into_its_checkpoint(tmp_path):
     """Paper budgets of many settings and rounds: the index of a tensor file is capped at 4 MiB."""
-    row = {"round": 10**6, "setting": "mass=0.5x", "true_return": 1 / 3, "progress": float("nan")}
-    rows = [row] * 100_000
-    assert len(json.dumps(rows)) > 8 << 20
-    data = _state(Trainer(), None, None, 7, rows)
-    names = {"trainer", "adversary", "selection", "round", "rows"}
-    state = checkpoints.restore(data, names, pytest.fail)
-    restored = json.loads(state["rows"].numpy().tobytes())
-    assert len(restored) == len(rows) and repr(restored[-1]) == repr(row)
+    saved = Saved()
+    job = Job(None, {}, tmp_path / "key" / "out", saved, Silent())
+    rows = run_training(job, LongTraining(100_000))
+    assert len(saved.data) > 8 << 20
+    restored = run_training(job, LongTraining(0))
+    assert len(restored) == len(rows) and repr(restored[-1]) == repr(LongTraining.ROW)
 
 
 def test_a_checkpoint_larger_than_a_foreign_file_may_be_is_read():

@@ -413,6 +413,21 @@ def test_no_experts(irl, tmp_path):
     assert refused.code == 2 and "--seeds" in refused.err
 
 
+def test_an_intervention_without_held_out_values_has_experts(irl, table_store, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text("[interventions.engine-power]\nood = []\n")
+    common = ["--store", table_store, "--profile", "smoke", *SMALL, "--settings", file]
+    done = irl("report", "experts", *ROW, *common)
+    assert done.code == 0, done.err
+    found = pd.read_csv(Path(done.out.strip()) / "experts.csv").set_index("setting")
+    assert "engine-power=1.5x" not in found.index
+    assert found.loc["engine-power=1x", "stands"] == "done"
+    # It cannot be a row of a comparison.
+    refused = irl("plan", "table1", *ROW, *common)
+    assert refused.code == 2
+    assert "lunar-lander.engine-power has 2 settings to train in and 0 held out" in refused.err
+
+
 def test_baselines_alone_make_a_report(irl, tmp_path):
     """As after `make experts`: nobody has learned a reward yet."""
     common = ["--store", tmp_path / "runs", "--profile", "smoke", *SMALL]
