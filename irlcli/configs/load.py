@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 import msgspec
 from msgspec import Struct
 
+from irlcli.configs.relevance import check_registered
 from irlcli.configs.schema import Config, ExpertConfig, InterventionConfig
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
@@ -166,6 +167,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
             knob = next(k for k, v in tree["interventions"].items() if not _is_listed(v))
             field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
         raise UsageError(f"{field}: {message}", _field_hint(field)) from None
+    check_registered(config)
     for knob, values in config.interventions.items():
         trained, unseen = (
             parse_settings(env, f"{knob}={','.join(part)}") if part else ()

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from irlcli.configs.schema import AIRLConfig, MaxEntConfig, PPOConfig, TransferConfig
+from irlcli.configs.schema import AIRLConfig, Config, MaxEntConfig, PPOConfig, TransferConfig
 from irlcli.errors import UsageError, suggest
 from irlcli.learners import LEARNERS
 from irlcli.penalties import check_penalty
@@ -17,6 +17,21 @@ from irlcli.rl import ALGORITHMS
 _PPO = PPOConfig()
 _AIRL = AIRLConfig()
 _MAXENT = MaxEntConfig()
+
+
+def check_registered(config: Config) -> None:
+    """Refuse names that are in no registry.
+
+    Raises:
+        UsageError: an unknown learner, algorithm or penalty; the message names the field.
+    """
+    _check_known("airl.learner", config.airl.learner, LEARNERS)
+    _check_known("transfer.algorithm", config.transfer.algorithm, ALGORITHMS)
+    for section, penalty in (("airl", config.airl.penalty), ("maxent", config.maxent.penalty)):
+        try:
+            check_penalty(penalty, section)
+        except UsageError as error:
+            raise UsageError(f"{section}.penalty: {error.message}", error.hint) from None
 
 
 def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOConfig:
