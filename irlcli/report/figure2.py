@@ -186,9 +186,9 @@ def draw(
         f"means over {summarised['datasets'].iloc[0]} datasets, with bootstrap 95 % intervals."
     )
     with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
-        figure = plt.figure(figsize=(15, 16), layout="constrained")
+        figure = plt.figure(figsize=(15, 17), layout="constrained")
         figure.suptitle(caption, fontsize=10)
-        grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 5.4])
+        grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 6.5])
         tops = [grid[i].subgridspec(1, 4) for i in range(2)]
         axes = [figure.add_subplot(tops[k // 4][k % 4]) for k in range(8)]
         _draw_experts(axes[0], maze)

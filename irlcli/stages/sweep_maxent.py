@@ -57,19 +57,19 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Variant, ...]:
-    """The baselines, then each penalty at all lambdas, and its control at the paper's lambdas.
+    """The baselines, then each penalty at every lambda, with true and with shuffled labels.
 
-    IRM with lambda 0 is ERM-balanced, which is therefore the low end of every sweep over lambda.
+    With lambda 0 both are ERM-balanced, which is therefore the low end of every sweep over lambda.
     """
     weights = sorted({*penalty_weights, *PAPER_PENALTY_WEIGHTS} - {0.0})
     found = [Variant(grouping="pooled", l2=l2) for l2 in sorted({*l2s, PAPER_L2, 0.0})]
     found.append(Variant(grouping="balanced"))
-    for penalty in PENALTIES:
-        for grouping, swept in (("per-setting", weights), ("shuffled", PAPER_PENALTY_WEIGHTS)):
-            found += [
-                Variant(grouping=grouping, penalty=penalty, penalty_weight=weight)
-                for weight in swept
-            ]
+    found += [
+        Variant(grouping=grouping, penalty=penalty, penalty_weight=weight)
+        for penalty in PENALTIES
+        for grouping in ("per-setting", "shuffled")
+        for weight in weights
+    ]
     return tuple(found)
 
 
