@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from irlcli import __version__
 from irlcli.cli.console import print_data
 
 # Command -> (module of this package, one-line help). The function has the command's name, with
@@ -70,9 +71,7 @@ app = typer.Typer(
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
-
-        print_data(f"irlcli {version('irlcli')}")
+        print_data(f"irlcli {__version__}")
         raise typer.Exit
 
 

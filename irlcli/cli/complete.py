@@ -26,15 +26,16 @@ def groupings(incomplete: str) -> list[str]:
 
 def airl_penalties(incomplete: str) -> list[str]:
     """Penalties of adversarial learners."""
-    return _penalties("airl")
+    return penalties("airl")
 
 
 def maxent_penalties(incomplete: str) -> list[str]:
     """Penalties of MaxEnt IRL."""
-    return _penalties("maxent")
+    return penalties("maxent")
 
 
-def _penalties(learner: str) -> list[str]:
+def penalties(learner: str) -> list[str]:
+    """Penalties of ``learner``: ``airl`` or ``maxent``."""
     from irlcli.penalties import PENALTIES
 
     return [name for name, penalty in PENALTIES.items() if learner in penalty.learners]

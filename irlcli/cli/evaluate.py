@@ -14,9 +14,7 @@ from irlcli.errors import UsageError
 from irlcli.experiments.references import by_own_reward, evaluation, tensor_file
 from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.stages import evaluate as stage
-from irlcli.stages import train_expert
 from irlcli.stages.base import From, Request, Source
-from irlcli.stages.train_airl import describe
 from irlcli.store import Artefact
 
 
@@ -37,6 +35,8 @@ class _Reward(NamedTuple):
     @property
     def arguments(self) -> dict[str, Any]:
         """Keywords of ``evaluate.request``."""
+        from irlcli.stages.train_airl import describe
+
         label = f"{describe(self.origin.airl)} seed {self.origin.seed}"
         return {"reward": self.source, "reward_label": label}
 
@@ -172,6 +172,8 @@ def _of_agent(
     score = {} if scored_by is None else scored_by.arguments
     if agent != "expert":
         return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **score)]
+    from irlcli.stages import train_expert
+
     experts: list[tuple[Setting, Sequence[Setting]]]
     if trained_in is None:
         experts = [(setting, [setting]) for setting in settings]

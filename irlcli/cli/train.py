@@ -20,6 +20,10 @@ from irlcli.stages import train_maxent as maxent_stage
 from irlcli.store import Resolved, read_json
 
 
+def _listed(learner: str) -> str:
+    return f"Invariance penalty: {', '.join(complete.penalties(learner))}."
+
+
 @stage_command
 def train_airl(
     session: StageSession,
@@ -28,7 +32,7 @@ def train_airl(
     grouping: Grouping = None,
     penalty: Annotated[
         str | None,
-        typer.Option(help="none or irmv1.", autocompletion=complete.airl_penalties),
+        typer.Option(help=_listed("airl"), autocompletion=complete.airl_penalties),
     ] = None,
     penalty_weight: PenaltyWeight = None,
     choose_penalty: Annotated[
@@ -89,7 +93,7 @@ def train_maxent(
     grouping: Grouping = None,
     penalty: Annotated[
         str | None,
-        typer.Option(help="none, irmv1 or closed-form.", autocompletion=complete.maxent_penalties),
+        typer.Option(help=_listed("maxent"), autocompletion=complete.maxent_penalties),
     ] = None,
     penalty_weight: PenaltyWeight = None,
     l2: Annotated[float | None, typer.Option(help="Weight decay.")] = None,

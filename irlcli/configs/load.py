@@ -201,7 +201,8 @@ def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
         fields = dict.fromkeys(tree, InterventionConfig) if isinstance(tree, Mapping) else {}
         inside = "[interventions.KNOB] with id and ood"
     else:
-        fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
+        # Not msgspec.structs.fields, which evaluates the annotations anew: a hit comes through here.
+        fields = {name: kind.__annotations__[name] for name in kind.__struct_fields__}
         inside = f"[{'.'.join(path)}] with some of: {', '.join(fields)}"
     if not isinstance(tree, Mapping):
         raise UsageError(f"{'.'.join(path)}: expected a table, found {tree!r}", f"write {inside}")

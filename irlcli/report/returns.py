@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import statistics
+# math instead of statistics: a cache hit prints returns, and statistics is slow to import.
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from irlcli.data.descriptions import Evaluation, Subject
 from irlcli.errors import UsageError
@@ -16,8 +16,7 @@ _ORDER = ("expert", "student", "transfer", "random", "idle")
 _HINT = "a row is a sample over seeds: report runs that differ in anything else separately"
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One agent in one setting, a sample over seeds.
 
     Attributes:
@@ -41,12 +40,15 @@ class Row:
     @property
     def mean(self) -> float:
         """Mean over seeds."""
-        return statistics.fmean(self.returns)
+        return math.fsum(self.returns) / len(self.returns)
 
     @property
     def deviation(self) -> float | None:
         """Standard deviation over seeds (n - 1); None for one policy."""
-        return statistics.stdev(self.returns) if self.policies > 1 else None
+        if self.policies < 2:
+            return None
+        squares = math.fsum((x - self.mean) ** 2 for x in self.returns)
+        return math.sqrt(squares / (len(self.returns) - 1))
 
 
 def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> list[Row]:
@@ -107,7 +109,7 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
 
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
-    return statistics.fmean(known) if len(known) == len(values) else None
+    return math.fsum(known) / len(known) if known and len(known) == len(values) else None
 
 
 def agent_name(policy: Subject, setting: str) -> str:
