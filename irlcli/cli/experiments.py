@@ -54,7 +54,7 @@ def plan(
     tag: _Tag = None,
     experiments: TableFile = None,
 ) -> None:
-    """Show which steps of a table exist and which are missing, and why.
+    """Show which steps of a table exist or are missing, and why.
 
     HIT: in the store. FOUND: in a store of --from. RUN: can be computed now. RESUME: can be
     resumed. BLOCKED: waits for other steps. Nothing is computed, written or moved.
@@ -123,7 +123,7 @@ def run(
         Path | None, typer.Option("--out", help="Directory to copy the report's files to.")
     ] = None,
 ) -> None:
-    """Make what is missing of a table, several steps at a time, then its report.
+    """Compute the missing steps of a table, then its report.
 
     Each missing step is made by a process of its own: this command with --only NAME. Run it again
     after a failure or an interruption: finished steps are kept, interrupted ones resume.

@@ -51,12 +51,6 @@ def test_labels_of_evaluations_distinguish_policies(irl, store_copy, tmp_path):
         assert f"evaluate expert of {own} in lunar-lander engine-power=1.5x seed 0" in plan
 
 
-def test_version(irl):
-    from importlib.metadata import version
-
-    assert irl("--version") == (0, f"irlcli {version('irlcli')}\n", "")
-
-
 def test_state_only_can_be_switched_off(irl, smoke_store, tmp_path):
     (tmp_path / "on.toml").write_text("[airl]\nstate_only = true")
     plans = [
