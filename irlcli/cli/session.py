@@ -102,7 +102,7 @@ class StageSession(Session):
         self.workers = workers
         self.tensorboard = tensorboard
 
-    def config(self, env: str, flags: dict[str, Any] | None = None) -> "Config":
+    def config(self, env: str, flags: Mapping[str, Any] | None = None) -> "Config":
         """The config of ``env`` under this session's profile and overrides."""
         from irlcli.configs import load_config
 

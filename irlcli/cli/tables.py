@@ -62,8 +62,9 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
         choice.env,
     )
-    if choice.until not in (None, *PHASES):
-        raise UsageError(f"unknown --until {choice.until!r}", suggest(choice.until, PHASES))
+    until = choice.until or PHASES[-1]
+    if until not in PHASES:
+        raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
     candidates: Sequence[float] = ()
     if choice.choose_penalty is not None:
         if table.kind != "comparison":
@@ -71,7 +72,6 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         candidates = arguments.weights(choice.choose_penalty)
     tag = choice.tag or (table.name if table.settings else session.profile)
     session.table_file = table.settings
-    until = choice.until or PHASES[-1]
     selection = Selection(tag, candidates, until, choice.only)
     return Plan(table, selection, session.config, session.runner().lookup())
 

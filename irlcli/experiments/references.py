@@ -1,14 +1,14 @@
-"""What a reference given to ``--demos``, ``--reward`` or ``--policy`` stands for.
+"""What a reference given to ``--demos``, ``--reward`` or ``--policy`` names.
 
-Planning needs to know the environment and the settings behind it. Inside the store a JSON
-output says so and no tensor library is loaded; a foreign file is opened and asked.
+Planning needs the environment and the settings behind it. An artefact has them in a JSON output,
+which is read without a tensor library. A foreign file has to be loaded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
@@ -17,15 +17,23 @@ from irlcli.stages.base import Source
 from irlcli.store import Artefact, Index, Resolved, Store, read_json
 
 
+@overload
+def tensor_file(
+    store: Store, ref: str, kind: Literal["reward"]
+) -> tuple[Source, descriptions.Reward]: ...
+@overload
+def tensor_file(
+    store: Store, ref: str, kind: Literal["policy"]
+) -> tuple[Source, descriptions.Policy]: ...
 def tensor_file(
     store: Store, ref: str, kind: Literal["reward", "policy"]
 ) -> tuple[Source, descriptions.Reward | descriptions.Policy]:
     """The ``reward`` or ``policy`` that ``ref`` names, and its description.
 
-    A reference to a whole artefact stands for its file of that kind.
+    A reference to a whole artefact means its file of that kind.
 
     Raises:
-        NotFound: no such thing, or an artefact without one.
+        NotFound: ``ref`` names nothing, or an artefact without such a file.
         UsageError: a tensor file of the other kind.
         IntegrityError: damaged, foreign or hostile.
     """
@@ -42,7 +50,7 @@ def tensor_file(
     if artefact.manifest.record.stage == "train-maxent":
         raise UsageError(
             f"{ref!r} is a tabular-reward, not a {kind}",
-            "policies are not trained on it: its quality.json says what it is worth",
+            "no policy is trained on it; its quality.json rates it",
         )
     output = resolved.output or _only(artefact, f"{kind}.pt")
     if output != f"{kind}.pt":
@@ -50,17 +58,18 @@ def tensor_file(
             f"{ref!r} is {output}, not a {kind}", f"name {artefact.id}/{kind}.pt or the artefact"
         )
     source = source_of(Resolved(artefact, artefact.directory / output))
-    form = descriptions.Reward if kind == "reward" else descriptions.Policy
     path = store.open(artefact, _only(artefact, f"{kind}.json"))
-    return source, descriptions.parse(read_json(path), form, path)
+    if kind == "reward":
+        return source, descriptions.parse(read_json(path), descriptions.Reward, path)
+    return source, descriptions.parse(read_json(path), descriptions.Policy, path)
 
 
 def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
     """The dataset that ``ref`` names, its environment and its settings.
 
     Raises:
-        NotFound: no such thing.
-        UsageError: something else than demonstrations.
+        NotFound: ``ref`` names nothing.
+        UsageError: anything other than demonstrations.
         IntegrityError: damaged or foreign.
     """
     resolved = store.resolve(ref)
@@ -75,33 +84,33 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
         what = resolved.output or f"a {record.stage} artefact"
         raise UsageError(
             f"{ref!r} is {what}, not a dataset of demonstrations",
-            "name an artefact that `irl collect-experts` made",
+            "name an artefact of `irl collect-experts`",
         )
     about = descriptions.parse(record.parameters, descriptions.Dataset, artefact.directory)
     return source_of(resolved), about.env, list(about.settings)
 
 
 def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluation]:
-    """The evaluation that ``ref`` names and its summary.
+    """The evaluation that ``ref`` names, and its summary.
 
     Raises:
-        NotFound: no such thing.
-        UsageError: no evaluation.
+        NotFound: ``ref`` names nothing.
+        UsageError: not an evaluation.
         IntegrityError: damaged.
     """
     artefact = store.resolve(ref).artefact
     if artefact is None or artefact.manifest.record.stage != "evaluate":
-        raise UsageError(f"{ref!r} is no evaluation", "name artefacts that `irl evaluate` made")
+        raise UsageError(f"{ref!r} is not an evaluation", "name artefacts of `irl evaluate`")
     path = store.open(artefact, _only(artefact, "summary.json"))
     return artefact, descriptions.parse(read_json(path), descriptions.Evaluation, path)
 
 
 def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
-    """Every parameter behind an evaluation that its seeds have in common: ``STAGE.FIELD`` to value.
+    """The parameters behind an evaluation that all its seeds share, by ``STAGE.FIELD``.
 
-    Without the seeds themselves, and without a lambda that was chosen for each of them. Of what
-    came from outside the store only the content is known. A reward that is not the policy's own
-    has ``reward.`` before its names.
+    They exclude the seeds, and a lambda that was chosen for each seed. An input from outside the
+    store contributes only its content. The names for a reward other than the policy's own begin
+    with ``reward.``.
     """
     found: dict[str, Any] = {}
     pending = [(artefact, "")]
@@ -126,7 +135,7 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
 
 
 def by_own_reward(evaluation: Artefact, index: Index) -> bool:
-    """Whether the reward that an evaluation measured by is the one its policy was trained on."""
+    """Whether the policy was trained on the reward that the evaluation scored it by."""
     inputs = evaluation.manifest.record.inputs
     if "reward" not in inputs or "policy" not in inputs:
         return False
@@ -156,7 +165,7 @@ def output(
 
     Raises:
         NotFound: the artefact has no such output.
-        IntegrityError: damaged, or of another form.
+        IntegrityError: damaged, or not a ``form``.
     """
     path = store.open(artefact, _only(artefact, name))
     return descriptions.convert(read_json(path), form, path)

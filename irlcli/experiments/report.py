@@ -12,7 +12,7 @@ import msgspec
 from irlcli.errors import NotFound
 from irlcli.experiments import facts
 from irlcli.experiments.plan import Plan
-from irlcli.experiments.rows import Task
+from irlcli.experiments.rows import Task, made_by
 from irlcli.experiments.status import source_in
 from irlcli.interventions import parse_settings
 from irlcli.report.parameters import Cell, Row
@@ -178,7 +178,9 @@ def _chosen(plan: Plan, row: str) -> dict[str, float]:
     for method in plan.table.methods:
         for seed in plan.table.seeds:
             task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")
-            choice = task and task.request.inputs.get("penalty choice")
-            if choice and _held(plan, choice.request) is not None:
+            if task is None or "penalty choice" not in task.request.inputs:
+                continue
+            choice = made_by(task.request.inputs["penalty choice"])
+            if _held(plan, choice) is not None:
                 found[f"{method} {seed}"] = task.request.parameters.airl.penalty_weight
     return found

@@ -31,7 +31,7 @@ from irlcli.stages import (
     train_expert,
     transfer,
 )
-from irlcli.stages.base import From, Request
+from irlcli.stages.base import From, Request, Source
 from irlcli.store import file_digest, read_json
 
 Phase = Literal["experts", "demos", "rewards", "transfers", "returns"]
@@ -107,7 +107,8 @@ class _RowRequests:
         policy: Request | None,
         agent: Literal["policy", "random", "idle"] = "policy",
         reward: Request | None = None,
-        labels: Mapping[str, str] | None = None,
+        policy_label: str = "",
+        reward_label: str = "",
     ) -> Request:
         return evaluate.request(
             self.row.env,
@@ -115,8 +116,9 @@ class _RowRequests:
             self.config.evaluation,
             None if policy is None else From(policy, "policy.pt"),
             agent,
+            policy_label=policy_label,
             reward=None if reward is None else From(reward, "reward.pt"),
-            **(labels or {}),
+            reward_label=reward_label,
         )
 
     def expert_tasks(self, places: Sequence[Setting]) -> Iterator[Task]:
@@ -127,8 +129,9 @@ class _RowRequests:
         """Name and request of an expert's returns in its own setting."""
         only = self.unseen == (place,)
         name = "expert-returns" if only else f"expert.{_value(place)}.returns"
-        labels = {"policy_label": f"expert of {place}"}
-        return f"{self.row}.{name}", self.returns([place], self.expert(place), labels=labels)
+        label = f"expert of {place}"
+        request = self.returns([place], self.expert(place), policy_label=label)
+        return f"{self.row}.{name}", request
 
 
 def comparison(
@@ -161,14 +164,14 @@ def comparison(
     name, request = requests.own_returns(unseen[0])
     yield Task(name, "returns", request, requests.cell("expert", "ood", place=place))
     for e in trained:
-        expert, label = requests.expert(e), {"policy_label": f"expert of {e}"}
+        expert, label = requests.expert(e), f"expert of {e}"
         if "id" in measures:
             name, request = requests.own_returns(e)
             yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
         for measure, places in (("ood", unseen), ("id", trained)):
             if measure == "ood" or "id" in measures:
                 name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
-                request = requests.returns(places, expert, labels=label)
+                request = requests.returns(places, expert, policy_label=label)
                 cell = requests.cell("reused", measure, place=str(e))
                 yield Task(name, "returns", request, cell)
     for name, seed in runs:
@@ -206,37 +209,40 @@ def _run(
     learned = train_airl.request(From(demos), env, trained, airl, seed, basis)
     yield Task(name, "rewards", learned)
     learner = f"{train_airl.describe(learned.parameters.airl)} seed {seed}"
-    student = {"policy_label": f"student {method_name} of seed {seed}"}
+    student = f"student {method_name} of seed {seed}"
     if "zero-shot" in measures:
         cell = requests.cell(method_name, "zero-shot", seed)
-        request = requests.returns(unseen, learned, labels=student)
+        request = requests.returns(unseen, learned, policy_label=student)
         curves = {"reward-learning": learned}
         yield Task(f"{name}.zero-shot-returns", "returns", request, cell, curves)
     if "id" in measures:
         cell = requests.cell(method_name, "id", seed)
-        request = requests.returns(trained, learned, labels=student)
+        request = requests.returns(trained, learned, policy_label=student)
         yield Task(f"{name}.id-returns", "returns", request, cell)
     if "transfer" in measures:
         moved = transfer.request(
             From(learned, "reward.pt"), env, unseen[0], requests.config.transfer, seed, learner
         )
         yield Task(f"{name}.transfer", "transfers", moved)
-        labels = {"reward_label": learner, "policy_label": f"transfer {method_name} of seed {seed}"}
         cell = requests.cell(method_name, "transfer", seed)
-        request = requests.returns(unseen, moved, reward=learned, labels=labels)
+        label = f"transfer {method_name} of seed {seed}"
+        request = requests.returns(
+            unseen, moved, reward=learned, policy_label=label, reward_label=learner
+        )
         curves = {"transfer-learning": moved}
         yield Task(f"{name}.transfer-returns", "returns", request, cell, curves)
-        labels["policy_label"] = f"expert of {unseen[0]}"
         cell = requests.cell(method_name, EXPERT_BY_REWARD, seed, str(unseen[0]))
-        expert = requests.expert(unseen[0])
-        request = requests.returns(unseen, expert, reward=learned, labels=labels)
+        expert, label = requests.expert(unseen[0]), f"expert of {unseen[0]}"
+        request = requests.returns(
+            unseen, expert, reward=learned, policy_label=label, reward_label=learner
+        )
         yield Task(f"{name}.expert-by-reward", "returns", request, cell)
 
 
 def _choice(name: str, choice: Request) -> Iterator[Task]:
     """The choice of lambda, after the rewards learned for it and what their students earn."""
-    for measured in (source.request for source in choice.inputs.values()):
-        learned = measured.inputs["policy"].request
+    for measured in map(made_by, choice.inputs.values()):
+        learned = made_by(measured.inputs["policy"])
         left_out = measured.parameters.settings[0].partition("=")[2].replace(":", "_")
         trial = f"{name}.{learned.parameters.airl.penalty_weight:g}.without-{left_out}"
         yield Task(trial, "rewards", learned)
@@ -273,12 +279,18 @@ def gridworld_figure(configs: Configs) -> tuple[list[Task], Request]:
         for setting in parse_settings(env, f"{knob}={','.join(listed.ood)}")
     ]
     figure = figure2.request(env, trained, unseen, config)
-    sweep = figure.inputs["sweep"].request
+    sweep = made_by(figure.inputs["sweep"])
     tasks = [
-        Task(f"figure2.demos.{source.request.parameters.seed}", "demos", source.request)
-        for source in sweep.inputs.values()
+        Task(f"figure2.demos.{demos.parameters.seed}", "demos", demos)
+        for demos in map(made_by, sweep.inputs.values())
     ]
     return [*tasks, Task("figure2.sweep", "rewards", sweep)], figure
+
+
+def made_by(source: Source | From) -> Request:
+    """The request that makes an input."""
+    assert isinstance(source, From)
+    return source.request
 
 
 def _value(setting: Setting) -> str:

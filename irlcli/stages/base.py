@@ -103,7 +103,7 @@ class Request(NamedTuple):
     """
 
     stage: Stage
-    parameters: msgspec.Struct
+    parameters: Any
     inputs: Mapping[str, Source | From]
     label: str
 
