@@ -154,6 +154,9 @@ def run(
         if not outcome.interrupted and until is None:
             _report(session, runner, found, choice, directory, outcome)
     _raise_for(outcome, found)
+    if session.as_json and until is not None:
+        counts = {field: len(getattr(outcome, field)) for field in ("existed", "copied", "made")}
+        out.print_json("run", {"table": table, **counts})
 
 
 def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str) -> None:

@@ -1,5 +1,6 @@
 """What ``irl run`` shows while it works: an overall bar and a line per running job."""
 
+import re
 import time
 from typing import Any
 
@@ -98,7 +99,12 @@ class LiveJobs(PlainJobs):
 
     def line(self, name: str, text: str) -> None:
         if text.startswith("  ") and name in self._bars:
-            self._progress.update(self._bars[name], detail=text.rpartition(": ")[2])
+            detail = text.rpartition(": ")[2]
+            share = re.match(r"([\d,]+)/([\d,]+) ", detail)
+            if share:
+                done, total = (int(number.replace(",", "")) for number in share.groups())
+                self._progress.update(self._bars[name], completed=done, total=total)
+            self._progress.update(self._bars[name], detail=detail)
         else:
             super().line(name, text)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from irlcli.configs import Config
-from irlcli.errors import NotFound, UsageError, closest
+from irlcli.errors import UsageError, closest
 from irlcli.experiments import rows
 from irlcli.experiments.rows import PHASES, Chosen, Configs, Task
 from irlcli.experiments.status import STATUSES, Lookup, Step
@@ -155,20 +155,6 @@ class Plan:
         """How many steps have each status."""
         found = Counter(self.lookup(task.request).status for task in self.tasks.values())
         return {status: found[status] for status in STATUSES}
-
-    def require_all(self) -> None:
-        """Check that every step exists.
-
-        Raises:
-            NotFound: some do not.
-        """
-        missing = [name for name in self.tasks if not self.exists(name)]
-        if missing:
-            raise NotFound(
-                f"{len(missing)} of {len(self.tasks)} steps of {self.table.name} are missing, "
-                f"for example {missing[0]}",
-                f"`irl run {self.table.name}` makes them",
-            )
 
 
 class _Identities:

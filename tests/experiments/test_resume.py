@@ -1,4 +1,4 @@
-"""Killed and interrupted stages go on, and end in the same bytes as if nothing had happened."""
+"""Killed and interrupted stages resume, and end in the same bytes as uninterrupted ones."""
 
 import contextlib
 import os
@@ -148,7 +148,7 @@ def interrupted(arguments, count, gap=0.05):
 
 @pytest.mark.parametrize(("count", "gap"), [(1, 0.05), (2, 0.05), (2000, 0.002)])
 def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count, gap):
-    """Also a key that is held down: the signals that hit the way out change nothing."""
+    """Also while a key is held down: signals during the exit change nothing."""
     arguments = ["evaluate", "--random", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
     arguments += ["--episodes", "1500", "--store", str(tmp_path / "runs")]
     code, errors = interrupted(arguments, count, gap)
@@ -178,7 +178,7 @@ def test_a_foreign_input_that_changes_after_planning_is_noticed(tmp_path):
         Runner(tmp_path / "runs").run(request)
 
 
-def test_a_damaged_checkpoint_is_said_aloud_and_not_used(tmp_path):
+def test_a_damaged_checkpoint_is_reported_and_not_used(tmp_path):
     process = start(tmp_path, "collect-experts")
     assert kill_after_checkpoint(tmp_path, process)
     (path,) = checkpoints(tmp_path)

@@ -13,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from test_architecture import loaded_by
 
 from irlcli.store import Store
 
@@ -115,6 +116,9 @@ def test_what_exists_needs_no_process(uninterrupted, runs):
     before = earlier.log.read_bytes()
     errors = runs.run(store, *REWARDS, "--experiments", earlier.tables)
     assert "6 of 6 steps exist" in errors
+    process = runs.start(store, *REWARDS, "--experiments", earlier.tables, "--json")
+    document = json.loads(process.communicate(timeout=60)[0])
+    assert (document["kind"], document["existed"], document["made"]) == ("run", 6, 0)
     assert runs.processes() == [] and earlier.log.read_bytes() == before
 
 
@@ -176,6 +180,38 @@ def test_a_failed_step_stops_only_what_depends_on_it(runs, tmp_path):
     before = len(runs.processes())
     runs.run(store, "--until", "returns")
     assert len(runs.processes()) == before + 2 and len(Store(store).names()) == 13
+
+
+def test_a_damaged_artefact_is_set_aside_and_then_made_again(uninterrupted, runs, tmp_path):
+    ids, _ = uninterrupted
+    store = tmp_path / "runs"
+    runs.run(store, *REWARDS)
+    demos = Store(store).resolve(f"{ROW}.demos").artefact.directory
+    demos.chmod(0o755)
+    (demos / "summary.json").chmod(0o644)
+    (demos / "summary.json").write_text("{}")
+    errors = runs.run(store, *REWARDS, code=4)
+    assert f"{ROW}.demos failed: artefact {demos.name} was damaged" in errors
+    assert f"irl run tiny --only {ROW}.demos " in errors  # how to repair it
+    runs.run(store, *REWARDS)
+    assert Store(store).ids() == ids
+
+
+def test_a_damaged_copy_elsewhere_is_computed_instead(irl, store_copy, tmp_path):
+    tables = tmp_path / "tables.toml"
+    tables.write_text(TABLES)
+    steps = store_copy.path / store_copy.demos / "steps.parquet"
+    steps.chmod(0o644)
+    data = bytearray(steps.read_bytes())
+    data[100] ^= 1
+    steps.write_bytes(data)
+    words = ["tiny", "--experiments", tables, "--profile", "smoke", "--store", tmp_path / "new"]
+    made = irl("run", *words, "--only", f"{ROW}.demos", "--from", store_copy.path)
+    assert made.code == 0, made.err
+    assert "warning: not copying artefact" in made.err and "RUN collect-experts" in made.err
+    assert made.err.count("FOUND train-expert") == 2
+    assert Path(made.out.strip()).name == store_copy.demos
+    assert steps.read_bytes() == data
 
 
 def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs, tmp_path):
@@ -265,3 +301,4 @@ def test_a_table_end_to_end(irl, smoke_store, tmp_path):
     second = irl("run", *words, "--jobs", "2")
     assert second.out == done.out and "\nRUN" not in second.err
     assert "11 of 11 steps exist" in second.err
+    assert loaded_by("run", *map(str, words)) == "LOADED []"
