@@ -1,46 +1,71 @@
-"""What a command costs before it does anything, against importing typer and rich.
+"""The cost of a command before it does any work, against importing typer and rich.
 
-Counted in CPU seconds of child processes, the least of several runs each, in one process run.
+Counted in instructions by ``valgrind --tool=callgrind``, which repeats to within a percent on a
+busy machine, where seconds do not. The budget of ``irl --help`` and of a cache hit is 1.5 times
+``import typer, rich``. The last column leaves out what starting Python costs.
+
+Run with ``python -m benchmarks.startup``; needs valgrind.
 """
 
 from __future__ import annotations
 
 import os
-import resource
+import re
 import subprocess
 import sys
 import tempfile
 
-RUNS = 15
+BUDGET = 1.5
+HIT = [
+    *("evaluate", "--random", "--env", "lunar-lander", "--intervention", "bounce=0.9"),
+    *("--profile", "smoke", "--quiet", "--json", "--store"),
+]
 
 
 def main() -> None:
-    """Print the cost of ``irl --help`` and of a cache hit, and their ratios."""
+    """Print the instructions of ``irl --help``, ``irl ls`` and a cache hit, and their ratios."""
+    bare = instructions("pass")
+    base = instructions("import typer, rich")
+    print(f"{'command':20}{'10^6 instructions':>18}{'x base':>8}{'x base, less Python':>21}")
     with tempfile.TemporaryDirectory() as store:
-        hit = [sys.executable, "-m", "irlcli", "evaluate", "--random", "--env", "lunar-lander"]
-        hit += ["--intervention", "bounce=0.9", "--profile", "smoke", "--quiet", "--store", store]
-        hit += ["--json"]
-        subprocess.run(hit, check=True, stdout=subprocess.DEVNULL)
-        base = _cost([sys.executable, "-c", "import typer, rich"])
-        print(f"{'command':20}{'CPU ms':>8}{'x base':>8}")
-        for name, command in {
-            "import typer, rich": None,
-            "irl --help": [sys.executable, "-m", "irlcli", "--help"],
-            "a cache hit": hit,
+        for name, cost in {
+            "import typer, rich": base,
+            "irl --help": instructions(_irl(["--help"])),
+            "a cache hit": instructions(_irl([*HIT, store])),
+            "irl ls": instructions(_irl(["ls", "--store", store])),
         }.items():
-            cost = base if command is None else _cost(command)
-            print(f"{name:20}{1e3 * cost:8.1f}{cost / base:8.2f}")
+            ratio = cost / base
+            late = "" if ratio <= BUDGET else "  over budget"
+            less = (cost - bare) / (base - bare)
+            print(f"{name:20}{cost / 1e6:18.1f}{ratio:8.2f}{less:21.2f}{late}")
 
 
-def _cost(command: list[str]) -> float:
+def _irl(arguments: list[str]) -> str:
+    """The code of the console script ``irl``, run on ``arguments``."""
+    return (
+        f"import sys; sys.argv = {['irl', *arguments]!r}\n"
+        "from irlcli.cli.main import main; main()"
+    )
+
+
+def instructions(code: str) -> int:
+    """Instructions of a Python process that runs ``code``, the second time it is run.
+
+    The first time it may compile modules, and compute what is then a hit.
+    """
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    costs = []
-    for _ in range(RUNS):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        costs.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    return min(costs)
+    environment["PYTHONHASHSEED"] = "0"
+    python = [sys.executable, "-c", code]
+    subprocess.run(python, check=True, capture_output=True, env=environment)
+    counted = subprocess.run(
+        ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", *python],
+        check=True,
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    (count,) = re.findall(r"Collected : (\d+)", counted.stderr)
+    return int(count)
 
 
 if __name__ == "__main__":

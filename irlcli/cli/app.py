@@ -48,8 +48,8 @@ class Commands(TyperGroup):
         }
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
-        name, listed, rest = super().resolve_command(ctx, args)
-        return name, listed and _load(listed.name), rest
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, None if name is None else _load(name), rest
 
 
 def _load(name: str) -> Any:

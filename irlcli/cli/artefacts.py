@@ -25,7 +25,7 @@ def ls(
     index = session.store.index()
     stored = list(index.artefacts.values())
     makers = {o.sha256: a.manifest.record for a in stored for o in a.manifest.outputs}
-    found = [
+    found: list[dict[str, Any]] = [
         {
             "id": artefact.id,
             "stage": record.stage,
@@ -43,7 +43,7 @@ def ls(
     if session.as_json:
         out.print_json("artefacts", {"artefacts": found, "newer": sorted(index.newer)})
         return
-    rows = [[item["id"], item["stage"], item["about"], ", ".join(item["names"])] for item in found]
+    rows = [[f["id"], f["stage"], f["about"], ", ".join(f["names"])] for f in found]
     if rows:
         out.print_table(["id", "stage", "about", "names"], rows)
 

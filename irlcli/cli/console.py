@@ -1,6 +1,6 @@
-"""What a person sees: progress and tables on stderr, data on stdout.
+"""Output: data on stdout; progress, tables and messages on stderr.
 
-Rich is loaded only where something is drawn: a hit prints one line without it.
+Rich is imported only to draw on a terminal. A cache hit prints one line without it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 JSON_VERSION = 1
 _PLAIN_SECONDS = 10.0
 _MAX_MESSAGE, _MAX_HINT = 900, 4000
-# What a file says may reach the screen: it must not drive the terminal, nor forge a second line.
+# Printed text may come from a file. It must not control the terminal or fake a second line.
 _CONTROLS = dict.fromkeys([*range(32), *range(127, 160), *range(0x202A, 0x202F)], "?")
 _CONTROLS_BUT_NEWLINE = {code: c for code, c in _CONTROLS.items() if code != ord("\n")}
 
@@ -32,13 +32,13 @@ class TerminalConsole:
 
     def __init__(self, quiet: bool = False, tensorboard: Path | None = None):
         self._quiet = quiet
-        self._live = None
-        self._task = None
+        self._live: Any = None
+        self._task: Any = None
         self._label = ""
         self._started = self._printed = 0.0
         self._first_done: int | None = None
         self._tensorboard = tensorboard
-        self._writer = None
+        self._writer: Any = None
         if tensorboard is not None:
             _require_tensorboard(tensorboard)
         self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
@@ -49,11 +49,11 @@ class TerminalConsole:
         return self._rich
 
     def share(self, live: Any) -> None:
-        """Print above the live display of somebody else; None when that has ended."""
+        """Print above another live display; None when that display has ended."""
         self._live = live
 
     def start(self, label: str, resumed: bool) -> None:
-        """A stage begins; ``resumed`` if from a checkpoint."""
+        """A stage starts; ``resumed`` from a checkpoint or not."""
         self._label = label
         self._started, self._first_done = time.monotonic(), None
         self._printed = self._started - _PLAIN_SECONDS
@@ -61,10 +61,10 @@ class TerminalConsole:
         self.say(f"{'RESUME' if resumed else 'RUN'} {label}")
 
     def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
-        """How far the present stage is."""
+        """Progress of the running stage."""
         now = time.monotonic()
         if self._first_done is None:
-            # A resumed stage did not do its first steps in this process.
+            # The first steps of a resumed stage were done by an earlier process.
             self._first_done, self._started = done, now
         rate = (done - self._first_done) / (now - self._started) if now > self._started else 0.0
         left = f"{duration((total - done) / rate)} left" if rate > 0 else ""
@@ -78,7 +78,7 @@ class TerminalConsole:
             self.say(f"  {self._label}: {done:,}/{total:,} {unit}  {detail}")
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Mirror metrics to TensorBoard, if asked."""
+        """Write metrics to TensorBoard if ``--tensorboard`` was given."""
         if self._tensorboard is None:
             return
         if self._writer is None:
@@ -90,15 +90,15 @@ class TerminalConsole:
             self._writer.add_scalar(name, value, step)
 
     def warn(self, message: str) -> None:
-        """Say it whatever else is shown."""
+        """Print a warning, also with ``--quiet``."""
         self._print(f"warning: {message}", style="bold yellow")
 
     def wait(self, label: str, holder: str) -> None:
-        """Another process makes the same artefact, or collects."""
+        """Another process makes the same artefact, or runs gc."""
         self.say(f"WAIT {label}: {holder} is at work on it")
 
     def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
-        """A stage ended, or its artefact was there."""
+        """A stage ended, or its artefact existed (``hit``)."""
         self._close_live()
         if self._writer is not None:
             self._writer.close()
@@ -111,7 +111,7 @@ class TerminalConsole:
         self.say(f"FOUND {label}: {artefact.directory}, copied from {where}")
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         self._close_live()
 
     def _draw(self, done: int, total: int, detail: str) -> None:
@@ -155,25 +155,25 @@ class TerminalConsole:
 
 
 def prepare_streams() -> None:
-    """Make stdout UTF-8 in every locale, and give a closed standard stream a place to go.
+    """Make stdout UTF-8 in every locale, and open closed standard streams on the null device.
 
-    File names that are no text come out as the bytes they are.
+    File names that are not valid text are printed as their bytes.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            # Else the next file opened, an artefact's perhaps, would have its descriptor.
+            # Otherwise the next file that is opened would get the stream's descriptor.
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(encoding="utf-8", errors="surrogateescape")
 
 
 def hang_up() -> NoReturn:
-    """The quiet end of a program whose output nobody reads any more (128 + SIGPIPE)."""
+    """End the program quietly because the reader closed the pipe (exit 128 + SIGPIPE)."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except BrokenPipeError:
-            # Python would complain again when it flushes at shutdown.
+            # Otherwise Python would print an error when it flushes at shutdown.
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
     sys.exit(141)
 
@@ -196,14 +196,14 @@ def print_data(text: str) -> None:
 
 
 def print_json(kind: str, value: Mapping[str, Any]) -> None:
-    """One JSON document on stdout, with the version of its form."""
+    """One JSON document on stdout, with the version of its schema."""
     print_data(json.dumps({"version": JSON_VERSION, "kind": kind, **value}, sort_keys=True))
 
 
 def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", stderr: bool = False
 ) -> None:
-    """A table for people; plain text with aligned columns where the stream is no terminal."""
+    """A table; plain text with aligned columns if the stream is not a terminal."""
     stream = sys.stderr if stderr else sys.stdout
     rows = [[str(cell).translate(_CONTROLS) for cell in row] for row in rows]
     if not stream.isatty():
@@ -227,7 +227,7 @@ def print_table(
 
 
 def print_error(error: IrlError, as_json: bool) -> None:
-    """One line and its hint on stderr; with ``--json`` a document on stdout too."""
+    """One line and its hint on stderr; with ``--json`` also a document on stdout."""
     message, hint = _shortened(error.message, _MAX_MESSAGE), _shortened(error.hint, _MAX_HINT)
     if as_json:
         document = {"message": message, "hint": hint, "exit_code": error.exit_code}
@@ -238,7 +238,7 @@ def print_error(error: IrlError, as_json: bool) -> None:
 
 
 def _shortened(text: str, most: int) -> str:
-    """``text`` without its middle where what it quotes is very long."""
+    """``text`` without its middle if it is longer than ``most`` characters."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
@@ -250,13 +250,15 @@ def duration(seconds: float) -> str:
 
 
 def _require_tensorboard(directory: Path) -> None:
-    """Say before the work, not after its first round, that the mirror cannot be written."""
+    """Fail before the work, not after its first round, if TensorBoard cannot be written."""
     import importlib.util
 
     if directory.exists() and not directory.is_dir():
-        raise UsageError(f"--tensorboard {directory} is no directory", "name one, or a new one")
+        raise UsageError(
+            f"--tensorboard {directory} is not a directory", "name a directory, or a new one"
+        )
     if importlib.util.find_spec("tensorboard") is None:
         raise UsageError(
             "--tensorboard needs the package tensorboard, which is not installed",
-            f"{sys.executable} -m pip install tensorboard, or leave --tensorboard away",
+            f"{sys.executable} -m pip install tensorboard, or omit --tensorboard",
         )

@@ -11,7 +11,7 @@ from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Evaluation
 from irlcli.data.descriptions import Reward as RewardDescription
 from irlcli.errors import UsageError
-from irlcli.experiments.references import by_own_reward, evaluation, tensor_file
+from irlcli.experiments import references
 from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.stages import evaluate as stage
 from irlcli.stages.base import From, Request, Source
@@ -89,12 +89,13 @@ def evaluate(
     where = _Where(intervention, "id") if ood is None else _Where(ood, "ood")
     scored_by = None
     if reward is not None:
-        source, origin = tensor_file(session.store, reward, "reward")
+        source, origin = references.tensor_file(session.store, reward, "reward")
         arguments.check_env(reward, origin.env, env)
         scored_by = _Reward(reward, source, origin)
     if policy is not None:
         requests = [_of_policy(session, policy, where, env, episodes, seed, scored_by)]
     else:
+        agent: Literal["expert", "random", "idle"]
         agent = "expert" if expert else "random" if random else "idle"
         requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scored_by)
     if name is not None and len(requests) > 1:
@@ -104,8 +105,8 @@ def evaluate(
         )
 
     def measured(artefact: Artefact) -> tuple[Evaluation, dict[str, Any], bool]:
-        own = scored_by is not None and by_own_reward(artefact, session.store.index())
-        return evaluation(session.store, artefact.id)[1], {}, own
+        own = scored_by is not None and references.by_own_reward(artefact, session.store.index())
+        return references.evaluation(session.store, artefact.id)[1], {}, own
 
     artefacts = session.deliver(
         requests, name, lambda artefact: {"returns": returns.as_json([measured(artefact)])}
@@ -123,7 +124,7 @@ def _of_policy(
     seed: int,
     scored_by: _Reward | None,
 ) -> Request:
-    source, origin = tensor_file(session.store, policy, "policy")
+    source, origin = references.tensor_file(session.store, policy, "policy")
     arguments.check_env(policy, origin.env, env)
     config = session.config(origin.env, {"evaluation.episodes": episodes})
     settings: Sequence[Setting]

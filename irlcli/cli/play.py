@@ -11,7 +11,7 @@ from irlcli.cli.options import Seed, store_command
 from irlcli.cli.session import Session
 from irlcli.configs import load_config
 from irlcli.errors import UsageError
-from irlcli.experiments.references import tensor_file
+from irlcli.experiments import references
 from irlcli.interventions import parse_setting
 
 
@@ -33,7 +33,7 @@ def play(
 
     The settings are those it was trained in, then those of --ood.
     """
-    source, origin = tensor_file(session.store, policy, "policy")
+    source, origin = references.tensor_file(session.store, policy, "policy")
     env = origin.env
     settings = [parse_setting(env, text) for text in origin.settings]
     if ood is not None:

@@ -57,7 +57,7 @@ def train_airl(
     flags = {
         **arguments.method_fields("airl", method, grouping, penalty),
         "airl.penalty_weight": penalty_weight,
-        "airl.select": str(parse_setting(env, select)) if "=" in (select or "") else select,
+        "airl.select": str(parse_setting(env, select)) if select and "=" in select else select,
         "airl.state_only": state_only,
     }
     config = session.config(env, flags)

@@ -8,7 +8,7 @@ from irlcli.cli import arguments
 from irlcli.cli.options import Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.errors import UsageError
-from irlcli.experiments.references import tensor_file
+from irlcli.experiments import references
 from irlcli.stages import transfer as stage
 from irlcli.stages.train_airl import describe
 
@@ -25,7 +25,7 @@ def transfer(
     name: Name = None,
 ) -> None:
     """Train a new policy on a frozen reward in an unseen setting."""
-    source, origin = tensor_file(session.store, reward, "reward")
+    source, origin = references.tensor_file(session.store, reward, "reward")
     arguments.check_env(reward, origin.env, env)
     config = session.config(origin.env)
     settings = arguments.named_settings(origin.env, config, ood, "ood", origin)

@@ -101,7 +101,7 @@ WRONG = [
     ("train-airl --demos demos --settings {tmp}/broken.toml", 2, "broken.toml"),
     ("train-airl --demos demos --settings {tmp}/unknown.toml", 2, "unknown.toml"),
     ("train-airl --demos demos --settings {tmp}/hostile.toml", 2, "hostile.toml"),
-    (f"collect-experts {LANDER} --tensorboard {{tmp}}/broken.toml", 2, "is no directory"),
+    (f"collect-experts {LANDER} --tensorboard {{tmp}}/broken.toml", 2, "is not a directory"),
     # Agents
     ("evaluate", 2, "no agents"),
     ("evaluate --random --idle", 2, "2 agents"),
