@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 import shlex
 import subprocess
@@ -56,15 +57,18 @@ def test_the_readme_leads_to_every_page() -> None:
         assert f"(docs/{page.name})" in readme, f"no link to docs/{page.name}"
 
 
-def shown_commands(page: Path) -> list[str]:
-    """Every ``irl ...`` of the code blocks and between backticks, without output and comments."""
+def shown_lines(page: Path) -> list[str]:
+    """Every line of the code blocks and every text between backticks, without comments."""
     lines = [line.removeprefix("$ ") for text in blocks(page) for line in text.splitlines()]
     prose = BLOCK.sub("", page.read_text("utf-8")).replace("\n", " ")
     lines += re.findall(r"`([^`]+)`", prose)
     # In a list of commands two spaces separate a command from its description.
-    return [
-        re.split(r"\s{2,}|\s\|\s", line)[0] for line in lines if re.match(r"irl -?-?[a-z]", line)
-    ]
+    return [re.split(r"\s{2,}|\s\|\s", line)[0] for line in lines if re.match(r"(irl|make) ", line)]
+
+
+def shown_commands(page: Path) -> list[str]:
+    """Every ``irl ...`` that names a command or an option."""
+    return [text for text in shown_lines(page) if re.match(r"irl -?-?[a-z]", text)]
 
 
 def check_command(text: str) -> None:
@@ -99,6 +103,23 @@ def test_every_command_shown_has_its_options(page: Path) -> None:
 def test_a_command_that_does_not_exist_is_noticed(text: str) -> None:
     with pytest.raises(AssertionError):
         check_command(text)
+
+
+def make_targets() -> list[str]:
+    """The Makefile's targets as patterns, ``%`` as ``*``."""
+    heads = re.findall(
+        r"^([a-z%][^:=\n]*):(?!=)", (CHECKOUT / "Makefile").read_text(), re.MULTILINE
+    )
+    return [word.replace("%", "*") for head in heads for word in head.split()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_every_make_target_shown_exists(page: Path) -> None:
+    targets = make_targets()
+    for text in shown_lines(page):
+        words = [word for word in shlex.split(text, comments=True) if "=" not in word]
+        for word in words[1:] if words[:1] == ["make"] else []:
+            assert any(fnmatch.fnmatch(word, target) for target in targets), text
 
 
 @pytest.mark.parametrize("name", ["python-api.md", "environments.md"])
