@@ -85,10 +85,10 @@ def runs(tmp_path):
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    """The ids of a run that nothing disturbed, and its log."""
+    """The ids of a run that nothing disturbed, its log, and what it printed."""
     directory = tmp_path_factory.mktemp("uninterrupted")
     runs = Runs(directory)
-    runs.run(directory / "runs", "--jobs", "2", *REWARDS)
+    runs.errors = runs.run(directory / "runs", "--jobs", "8", *REWARDS)
     return Store(directory / "runs").ids(), runs
 
 
@@ -104,6 +104,16 @@ def test_each_missing_artefact_has_one_process_and_one_name(uninterrupted):
         assert command[:5] == ["irl", "run", "tiny", "--only", name]
     pids = {line["pid"] for line in runs.lines() if "computes" in line}
     assert len(pids) == len(steps)
+
+
+def test_a_step_starts_when_what_it_needs_exists(uninterrupted):
+    _, runs = uninterrupted
+    lines = [line.split(" in ")[0].replace(f"{ROW}.", "") for line in runs.errors.splitlines()]
+    at = {line: number for number, line in enumerate(lines)}
+    assert at["RUN expert.1.5x"] < min(at[f"DONE expert.{value}"] for value in ("1x", "1.25x"))
+    assert at["RUN demos"] > max(at[f"DONE expert.{value}"] for value in ("1x", "1.25x"))
+    assert min(at["RUN erm.0"], at["RUN irm.0"]) > at["DONE demos"]
+    assert max(at["RUN erm.0"], at["RUN irm.0"]) < min(at["DONE erm.0"], at["DONE irm.0"])
 
 
 def _named(store, steps):
@@ -218,9 +228,9 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
     ids, _ = uninterrupted
     store = tmp_path / "runs"
     for count, slow in ((1, "0.3"), (2, "60")):
+        begin = len(runs.lines())
         process = runs.start(store, *REWARDS, "--jobs", "2", IRL_TEST_ROUND=slow)
-        before = len([line for line in runs.lines() if "computes" in line])
-        while len([line for line in runs.lines() if "computes" in line]) <= before:
+        while not any("computes" in line for line in runs.lines()[begin:]):
             assert process.poll() is None
             time.sleep(0.01)
         time.sleep(0.5)
@@ -230,8 +240,10 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
         out, errors = process.communicate(timeout=30)
         assert (process.returncode, out) == (130, "")
         assert "error: stopped: " in errors and "same command again" in errors
-        if count == 1:
-            assert list(store.glob(".work/*/checkpoint"))
+        computing = {line["pid"] for line in runs.lines()[begin:] if "computes" in line}
+        ended = {line["pid"] for line in runs.lines()[begin:] if "exits" in line}
+        assert (computing <= ended) == (count == 1)
+        assert list(store.glob(".work/*/checkpoint"))
     assert not _alive(line["pid"] for line in runs.lines())
     runs.run(store, *REWARDS)
     assert Store(store).ids() == ids

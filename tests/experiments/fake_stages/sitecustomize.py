@@ -6,6 +6,7 @@ IRL_TEST_LOG is the log, a JSON document per line; IRL_TEST_FAIL is the agent or
 IRL_TEST_ROUND is how long a round takes [s].
 """
 
+import atexit
 import hashlib
 import json
 import os
@@ -58,4 +59,5 @@ def install():
 
 if "IRL_TEST_LOG" in os.environ and "irlcli" in sys.orig_argv:
     log(argv=sys.orig_argv)
+    atexit.register(log, exits=True)  # a killed process does not
     install()
