@@ -142,11 +142,11 @@ def run(
     if until is not None and directory is not None:
         raise UsageError("--until makes no report, so --out has no files", "omit one of them")
     runner = session.runner()
+    found = open_plan(session, choice)
+    for name in found.tasks:
+        runner.store.check_name(name)
     runner.store.create()
     with session.reading():
-        found = open_plan(session, choice)
-        for name in found.tasks:
-            runner.store.check_name(name)
         if only is not None:
             _make_one(session, runner, found, only)
             return
@@ -162,15 +162,18 @@ def run(
 def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str) -> None:
     """Make one step and what it needs in this process, inputs first."""
     try:
-        # In a choice of lambda what follows is known only when the choice was made.
         for name in list(found.tasks):
-            artefact = runner.run(found.tasks[name].request)
-            runner.name(name, artefact)
-            if name != only and found.selection.candidates:
+            step = found.step(name)
+            artefact = step.artefact if step.status == "HIT" and name != only else None
+            if artefact is None:
+                artefact = runner.run(found.tasks[name].request)
+                # A choice of lambda decides what the next requests are.
                 found.refresh()
+            runner.name(name, artefact)
+            if name == only:
+                session.print_artefact(artefact, only)
     finally:
         session.console.close()
-    session.print_artefact(artefact, only)
 
 
 def _make_all(

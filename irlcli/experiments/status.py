@@ -1,7 +1,7 @@
 """What a store holds of a request: planning without computing, writing or moving anything."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import msgspec
 
@@ -17,6 +17,9 @@ from irlcli.store import (
     directory_outputs,
     file_digest,
 )
+
+if TYPE_CHECKING:
+    from irlcli.store.sources import Found
 
 Status = Literal["HIT", "FOUND", "RUN", "RESUME", "BLOCKED"]
 STATUSES: tuple[Status, ...] = ("HIT", "FOUND", "RUN", "RESUME", "BLOCKED")
@@ -54,6 +57,7 @@ class Lookup:
         self._sources = sources
         # By identity. The request is kept, so that no other object can get its id.
         self._steps: dict[int, tuple[Request, Step]] = {}
+        self._elsewhere: dict[str, Found | None] = {}
 
     def __call__(self, request: Request) -> Step:
         """The state of ``request``.
@@ -111,17 +115,22 @@ class Lookup:
             return Step("HIT", label, str(there.artefact.directory), there.artefact, key)
         if there.problem is not None:
             return Step("RUN", label, f"{there.problem}: it would be computed again", key=key)
-        if self._sources:
-            # A hit in a store without sources does not load it.
-            from irlcli.store.sources import find_in
-
-            found = find_in(self._sources, key)
-            if found is not None:
-                return Step("FOUND", label, f"in {found.store.root}", found.artefact, key)
+        found = self._find_elsewhere(key)
+        if found is not None:
+            return Step("FOUND", label, f"in {found.store.root}", found.artefact, key)
         if self.store.has_checkpoint(key):
             why = "a checkpoint exists: the run was interrupted, or another process is working"
             return Step("RESUME", label, why, key=key)
         return Step("RUN", label, f"no artefact has the key {key[:12]}", key=key)
+
+    def _find_elsewhere(self, key: str) -> "Found | None":
+        """Looked up once: the other stores do not change, and what is damaged there is warned of."""
+        if key not in self._elsewhere:
+            # A hit does not load it.
+            from irlcli.store.sources import find_in
+
+            self._elsewhere[key] = find_in(self._sources, key)
+        return self._elsewhere[key]
 
 
 def key_record(request: Request, inputs: Mapping[str, str]) -> KeyRecord:

@@ -109,6 +109,7 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         assert done.code == 2 and not done.out
         error, hint = done.err.splitlines()
         assert error.startswith("error: ") and hint.startswith("hint: ")
+        assert not (tmp_path / "runs").exists()
         return done.err
 
     assert "unknown table 'tabel1'" in refused("plan", "tabel1")
