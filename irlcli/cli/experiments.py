@@ -11,7 +11,7 @@ from irlcli.cli import complete
 from irlcli.cli import console as out
 from irlcli.cli.options import planning_command, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.cli.tables import Choice, copy_outputs, open_plan, print_report, report_of
+from irlcli.cli.tables import Choice, check_out, copy_outputs, open_plan, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
 
 if TYPE_CHECKING:
@@ -143,8 +143,8 @@ def run(
         raise UsageError("--until makes no report, so --out has no files", "omit one of them")
     runner = session.runner()
     found = open_plan(session, choice)
-    for name in found.tasks:
-        runner.store.check_name(name)
+    if directory is not None:
+        check_out(directory, runner.store.root)
     runner.store.create()
     with session.reading():
         if only is not None:

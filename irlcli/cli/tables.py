@@ -62,7 +62,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
         choice.env,
     )
-    until = choice.until or PHASES[-1]
+    until = PHASES[-1] if choice.until is None else choice.until
     if until not in PHASES:
         raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
     candidates: Sequence[float] = ()
@@ -73,7 +73,10 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     tag = choice.tag or (table.name if table.settings else session.profile)
     session.table_file = table.settings
     selection = Selection(tag, candidates, until, choice.only)
-    return Plan(table, selection, session.config, session.runner().lookup())
+    plan = Plan(table, selection, session.config, session.runner().lookup())
+    for name in plan.tasks:
+        session.store.check_name(name)
+    return plan
 
 
 def _words(text: str) -> list[str]:
@@ -90,6 +93,18 @@ def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":
 
     words = ["irl", "report", choice.table, *session.config_words(), *choice.words()]
     return report.request(plan, shlex.join(words))
+
+
+def check_out(directory: Path, store: Path) -> None:
+    """Refuse a directory for a report's files before any work is done.
+
+    Raises:
+        UsageError: it is a file, or lies in the store.
+    """
+    if directory.exists() and not directory.is_dir():
+        raise UsageError(f"--out {directory} is not a directory", "name a directory")
+    if directory.resolve().is_relative_to(store.resolve()):
+        raise UsageError(f"--out {directory} lies in the store", "name another directory")
 
 
 def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> None:

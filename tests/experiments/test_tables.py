@@ -124,7 +124,15 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         "run", "table1", "--profile", "smoke", "--only", step
     )
     assert "--tag NAME" in refused("run", "table1", "--set", "airl.penalty_weight=3")
-    assert "cannot be a name" in refused("run", "table1", "--tag", "a b")
+    for command in ("plan", "run"):
+        assert "cannot be a name" in refused(command, "table1", "--tag", "a b")
+    assert "the list is empty" in refused("plan", "table1", "--methods", "")
+    assert "unknown --until ''" in refused("plan", "table1", "--until", "")
+    (tmp_path / "file").touch()
+    assert "is not a directory" in refused("run", "demo", "--out", tmp_path / "file")
+    assert "lies in the store" in refused("run", "demo", "--out", tmp_path / "runs" / "out")
+    assert "--until makes no report" in refused("run", "demo", "--until", "demos", "--out", "x")
+    assert "--only takes no --until" in refused("run", "demo", "--only", "x", "--until", "demos")
     assert "--choose-penalty" in refused("run", "experts", "--choose-penalty", "1,2", "--tag", "x")
     own = tmp_path / "mine.toml"
     own.write_text(SOUND.replace("leg-length", "leg-lenght"))
