@@ -147,3 +147,36 @@ def test_a_read_only_store_takes_no_lock(empty_store, artefact):
     lock.unlink()
     with read_only(empty_store).in_use():
         assert not lock.exists()
+
+
+DRY_RUNS = {
+    "a hit": "transfer --reward {airl} --ood 1.5x",
+    "its input by id": "train-airl --demos {demos} --method irm",
+    "its input by name": "evaluate --policy moved --ood 1.5x",
+    "all of a table": "plan table1",
+}
+
+
+@pytest.mark.parametrize("name", ["a manifest", "an output", "nothing"])
+@pytest.mark.parametrize("kind", DRY_RUNS)
+def test_a_dry_run_changes_nothing_also_where_artefacts_are_damaged(irl, store_copy, kind, name):
+    """Whatever it prints, and whichever error it ends with."""
+    for artefact in list(Store(store_copy.path).artefacts()):
+        if name == "a manifest":
+            truncate(artefact.directory / "manifest.json")
+        elif name == "an output":
+            for output in artefact.manifest.outputs:
+                truncate(artefact.directory / output.path)
+    before = tree(store_copy.path)
+    line = DRY_RUNS[kind].format(airl=store_copy.airl, demos=store_copy.demos).split()
+    dry = [] if line[0] == "plan" else ["--dry-run"]
+    result = irl(*line, *dry, "--profile", "smoke", "--store", store_copy.path)
+    assert result.code in ((0,) if name == "nothing" else (0, 4)), result.err
+    assert tree(store_copy.path) == before
+
+
+def test_a_dry_run_creates_no_store(irl, tmp_path):
+    lander = ["--env", "lunar-lander", "--intervention", "bounce=0.9", "--profile", "smoke"]
+    result = irl("evaluate", "--idle", *lander, "--dry-run", "--store", tmp_path / "absent")
+    assert result.code == 0 and result.out.startswith("RUN"), result
+    assert list(tmp_path.iterdir()) == []

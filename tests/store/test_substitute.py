@@ -448,3 +448,39 @@ def test_two_adopters_interleaved_at_every_step(tmp_path, zoo):
             break
         assert rival == slow
     assert n > 20
+
+
+# From the command line
+
+IDLE = ["evaluate", "--idle", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
+IDLE += ["--profile", "smoke", "--episodes", "1", "--quiet"]
+
+
+def test_what_another_store_has_is_not_computed_again(irl, smoke_store, tmp_path):
+    line = ["collect-experts", "--env", "lunar-lander", "--profile", "smoke", "--store", tmp_path]
+    line += ["--intervention", "engine-power=1x,1.25x", "--from", smoke_store.path]
+    planned = irl(*line, "--dry-run")
+    assert planned.code == 0 and "FOUND" in planned.out and "RUN" not in planned.out
+    assert list(tmp_path.iterdir()) == []
+    result = irl(*line)
+    assert result.code == 0 and "RUN " not in result.err, result.err
+    assert Path(result.out.strip()).name == smoke_store.demos
+    assert Store(tmp_path).verify(Store(tmp_path).ids()) == {}
+
+
+def test_what_is_damaged_there_is_computed_with_a_warning(irl, tmp_path):
+    made = Path(irl(*IDLE, "--store", tmp_path / "zoo").out.strip())
+    (made / "summary.json").chmod(0o644)
+    flip(made / "summary.json")
+    result = irl(*IDLE, "--store", tmp_path / "runs", "--from", tmp_path / "zoo")
+    assert result.code == 0 and Path(result.out.strip()).name == made.name, result.err
+    (warning,) = [line for line in result.err.splitlines() if line.startswith("warning")]
+    assert str(made / "summary.json") in warning
+    assert made.exists() and not list((tmp_path / "zoo" / ".quarantine").iterdir())
+
+
+def test_the_environment_names_stores_too(irl, tmp_path, monkeypatch):
+    irl(*IDLE, "--store", tmp_path / "zoo")
+    monkeypatch.setenv("IRL_FROM", str(tmp_path / "zoo"))
+    planned = irl(*IDLE, "--dry-run", "--store", tmp_path / "runs")
+    assert "FOUND" in planned.out and str(tmp_path / "zoo") in planned.out
