@@ -1,4 +1,4 @@
-"""Canonical JSON and digests: these bytes are addresses, so they may never change."""
+"""Canonical JSON and digests. Keys and ids depend on these bytes, so they must never change."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ VALUES = st.recursive(
 
 
 def typed(value):
-    """``value`` with its types spelt out: in Python True == 1 == 1.0, in a key they differ."""
+    """``value`` with its types: True == 1 == 1.0 in Python, but they differ in a key."""
     if isinstance(value, dict):
         return {key: typed(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -59,7 +59,7 @@ def test_golden_bytes(value, expected):
 
 
 def test_golden_digests():
-    """Written down as literals: a change here orphans every artefact of every user."""
+    """A change of these literals would orphan every existing artefact."""
     assert digest({}) == "44136fa355b3678a1146ad16f7e8649e94fb4fc21fe77e8310c060f61caaff8a"
     record = KeyRecord("transfer", 1, {"seed": 0, "lr": 1e-5}, {"reward": "0" * 64})
     text = (
@@ -108,7 +108,7 @@ def test_refusal_names_the_place():
 
 
 @pytest.mark.parametrize("key", [1, 1.5, True, None, ("a",), b"a"])
-def test_keys_that_are_no_strings_are_refused(key):
+def test_keys_other_than_strings_are_refused(key):
     """json.dumps would print 1 and True as the strings "1" and "true"."""
     with pytest.raises(TypeError, match="not a string"):
         canonical_json({"outer": {key: 0}})
@@ -125,13 +125,13 @@ class Text(str):
 @pytest.mark.parametrize(
     "value", [b"x", {1, 2}, object(), 1j, Colour.RED, Text("x"), OrderedDict(a=1), range(3)]
 )
-def test_types_without_a_canonical_form_are_refused(value):
+def test_types_without_a_canonical_encoding_are_refused(value):
     with pytest.raises(TypeError, match="no canonical encoding"):
         canonical_json([value])
 
 
 def test_numpy_numbers_are_refused():
-    """np.float64 is a float to isinstance; letting it in would tie keys to numpy's printing."""
+    """np.float64 is a float to isinstance, but keys must not depend on how numpy prints it."""
     numpy = pytest.importorskip("numpy")
     for value in (numpy.float64(1), numpy.int64(1), numpy.bool_(True)):
         with pytest.raises(TypeError):
@@ -145,7 +145,7 @@ def test_file_digest_is_sha256(tmp_path_factory, data):
     assert file_digest(path) == hashlib.sha256(data).hexdigest()
 
 
-def test_file_digest_of_more_than_one_piece(tmp_path):
+def test_file_digest_of_more_than_one_chunk(tmp_path):
     data = bytes(range(256)) * 5000  # 1.28 MB, read in pieces of 1 MiB
     (tmp_path / "f").write_bytes(data)
     assert file_digest(tmp_path / "f") == hashlib.sha256(data).hexdigest()

@@ -30,7 +30,7 @@ PARAMETERS = {"seed": 0, "learning_rate": 1e-5, "name": "é"}
 
 @pytest.fixture
 def victim(empty_store, publish) -> Artefact:
-    """An artefact to damage; beside it in the store a bystander with files of the same names."""
+    """An artefact to damage, beside a bystander with files of the same names."""
     publish(empty_store, dict.fromkeys(FILES[:2], b"bystander " * 50), parameters={"seed": 1})
     return publish(empty_store, parameters=PARAMETERS).artefact
 
@@ -61,7 +61,7 @@ def swap(path: Path, other: Path) -> None:
 
 
 def link_out(path: Path, other: Path) -> None:
-    """The same bytes, but from outside the store, where anybody may change them later."""
+    """The same bytes outside the store, where anyone may change them later."""
     outside = path.parents[2] / f"outside-{path.name}"
     shutil.copy(path, outside)
     path.unlink()
@@ -74,7 +74,7 @@ def to_directory(path: Path, other: Path) -> None:
 
 
 def to_fifo(path: Path, other: Path) -> None:
-    """A reader that opens it would wait for ever."""
+    """A reader that opens it would wait forever."""
     path.unlink()
     os.mkfifo(path)
 
@@ -122,7 +122,7 @@ def test_verify_detects_sets_aside_and_recomputing_repairs(
 
 @pytest.mark.parametrize("name", ["extra.pt", "nested/extra", ".hidden", "new/extra"])
 @pytest.mark.parametrize("kind", ["file", "symlink", "fifo"])
-def test_verify_detects_what_was_added(empty_store, victim, name, kind):
+def test_verify_detects_added_files(empty_store, victim, name, kind):
     path = victim.directory / name
     path.parent.mkdir(exist_ok=True)
     match kind:
@@ -152,7 +152,7 @@ def test_verify_detects_a_linked_directory_inside(empty_store, victim, tmp_path)
 
 
 def test_swapped_artefacts_are_both_detected(empty_store, victim):
-    """Each is intact in itself; only its address is wrong."""
+    """Each is intact; only its directory's name is wrong."""
     other = bystander(empty_store, victim)
     for directory in (victim.directory, other.directory):
         directory.chmod(0o755)
@@ -175,7 +175,7 @@ def test_find_detects_damage_of_manifest_and_size(empty_store, victim, name, kin
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_open_never_hands_out_other_bytes(empty_store, victim, kind):
+def test_open_never_returns_altered_bytes(empty_store, victim, kind):
     other = bystander(empty_store, victim)
     DAMAGE[kind](victim.directory / "reward.pt", other.directory / "reward.pt")
     with pytest.raises(IntegrityError, match=victim.id) as caught:
@@ -198,8 +198,8 @@ def test_quick_verify_sees_sizes_only(empty_store, victim):
     assert list(empty_store.verify([victim.id], quick=True)) == [victim.id]
 
 
-def test_the_word_newer_in_a_path_protects_no_damage(tmp_path, publish):
-    """Only a newer schema is left in place; a directory may be called anything."""
+def test_the_word_newer_in_a_path_does_not_hide_damage(tmp_path, publish):
+    """Only artefacts of a newer schema stay in place, whatever the store's directory is called."""
     store = Store(tmp_path / "newer-runs")
     victim = publish(store).artefact
     rewrite(victim.directory / "manifest.json", lambda data: data[:-20])
@@ -227,7 +227,7 @@ MASKS = (0x01, 0x20, 0x80)  # the last bit, the case of a letter, the bit that A
 
 
 def test_every_byte_of_a_manifest_counts(victim, tmp_path):
-    """Also what leaves its meaning alone: 1E-05 for 1e-05, \\u00E9 for \\u00e9."""
+    """Also bytes that do not change the meaning: 1E-05 for 1e-05, \\u00E9 for \\u00e9."""
     data = (victim.directory / "manifest.json").read_bytes()
     unnoticed = []
     for i, mask in itertools.product(range(len(data)), MASKS):
@@ -251,7 +251,7 @@ def test_every_byte_of_a_provenance_counts(empty_store, victim, tmp_path):
 
 
 def plant(store: Store, manifest: Manifest, encoded: bytes | None = None) -> str:
-    """A hand-made artefact, its address in order, as somebody with a text editor makes it."""
+    """An artefact written by hand, in a directory that matches its manifest."""
     directory = store.root / manifest.id[:16]
     directory.mkdir()
     (directory / "manifest.json").write_bytes(encoded or manifest.encode())
@@ -296,7 +296,7 @@ def test_hostile_output_paths(empty_store, tmp_path, path):
 
 
 @pytest.mark.parametrize("path", [None, 5, ["a"], {"a": 1}, True, b"a"])
-def test_output_paths_that_are_no_text(path):
+def test_output_paths_other_than_text_are_refused(path):
     with pytest.raises(ValueError, match="not allowed"):
         check_output_path(path)
 
@@ -316,7 +316,7 @@ def test_huge_manifest_is_not_parsed(tmp_path):
 
 
 def test_deep_nesting_at_any_depth(empty_store, tmp_path):
-    """The parser, the checker and the encoder each have their own limit: none may escape."""
+    """Parser, checker and encoder have different limits: none may raise anything else."""
     for depth in [*range(1, 1100, 7), *range(850, 1000), 100_000]:
         nested = b"[" * depth + b"]" * depth
         (tmp_path / "manifest.json").write_bytes(
@@ -331,7 +331,7 @@ def test_deep_nesting_at_any_depth(empty_store, tmp_path):
 
 
 def test_newer_schema_is_named_and_left_where_it_is(empty_store, victim):
-    """It is not damaged: a newer program made it and can still read it."""
+    """It is not damaged: the newer version that wrote it can read it."""
 
     def bump(data: bytes) -> bytes:
         return json.dumps({**json.loads(data), "schema": 2, "new": 1}).encode()
@@ -393,7 +393,7 @@ def test_malformed_fields(victim, tmp_path, field, value):
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "9" * 5000])
 def test_numbers_outside_json(victim, tmp_path, number):
-    """json.loads takes NaN and turns 1e999 into infinity; neither has a canonical form."""
+    """json.loads accepts NaN and reads 1e999 as infinity; neither has a canonical encoding."""
     text = (victim.directory / "manifest.json").read_text()
     (tmp_path / "manifest.json").write_text(text.replace("1e-05", number))
     with pytest.raises(IntegrityError):
@@ -457,7 +457,7 @@ OUTPUTS = st.lists(
     )
 )
 def test_fuzz_structure(scratch_directory, value):
-    """Near-valid manifests: read as exactly what they say, or refused."""
+    """Almost valid manifests are read exactly, or refused."""
     (scratch_directory / "manifest.json").write_text(json.dumps(value))
     try:
         manifest = read_manifest(scratch_directory)
@@ -531,7 +531,7 @@ def test_pointer_to_another_artefact_is_not_followed(empty_store, victim, publis
 
 
 @pytest.mark.parametrize("place", [".keys", ".names"])
-def test_rubbish_among_pointers_disturbs_nobody(empty_store, victim, place):
+def test_rubbish_among_pointers_is_ignored(empty_store, victim, place):
     """A directory, a dangling link and another's temporary file where only pointers belong."""
     name = "f" * 64 if place == ".keys" else "rubbish"
     (empty_store.root / place / name).mkdir()
@@ -567,8 +567,8 @@ def test_newer_store_is_refused(empty_store):
 
 
 @pytest.mark.parametrize("name", ["notes.txt", ".git", ".bashrc"])
-def test_directory_of_somebody_else_is_no_store(tmp_path, name):
-    """Only what a crash while creating a store leaves is taken for one that is not finished."""
+def test_a_directory_with_other_files_is_refused(tmp_path, name):
+    """Only the files that an interrupted create() leaves are accepted."""
     (tmp_path / name).mkdir()
     with pytest.raises(IntegrityError, match="not a store"):
         Store(tmp_path)

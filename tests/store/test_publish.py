@@ -1,8 +1,4 @@
-"""Publishing: whole or absent, whatever happens in the middle.
-
-The protocol is attacked at the calls it makes of the operating system: each one that changes the
-file system is numbered, and the process is killed, or the call fails, at every number in turn.
-"""
+"""Publishing: an artefact is whole or absent, wherever a process is killed or a call fails."""
 
 # ruff: noqa: B023 (the closures over a loop's variables run within their own iteration)
 
@@ -27,13 +23,13 @@ RECORD = KeyRecord("train-airl", 1, {"seed": 0, "rate": 1e-5}, {"demonstrations"
 def attempt(
     store: Store, files: dict[str, bytes] = FILES, attempt_name: str = "out.0"
 ) -> Published:
-    """One publisher, without the lock: correctness must not depend on it."""
+    """Publish without the lock: correctness must not depend on it."""
     output = stage_output(store, files, attempt_name)
     return store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
 
 
 def stage_output(store: Store, files: dict[str, bytes], attempt_name: str) -> Path:
-    """What a stage leaves in its output directory."""
+    """An output directory as a stage leaves it."""
     output = store.root / ".work" / RECORD.key / attempt_name
     for name, data in files.items():
         (output / name).parent.mkdir(parents=True, exist_ok=True)
@@ -42,7 +38,7 @@ def stage_output(store: Store, files: dict[str, bytes], attempt_name: str) -> Pa
 
 
 def assert_whole_or_absent(store: Store) -> None:
-    """Nothing half-published: what readers can see is complete and unaltered."""
+    """Whatever readers can see is complete and unaltered."""
     assert store.verify(store.ids()) == {}
     found = store.find(RECORD.key)
     if found is not None:
@@ -116,7 +112,7 @@ def test_sigkill_at_every_step_of_create(tmp_path):
 
 
 def test_sigkill_at_every_step_of_naming(tmp_path):
-    """A name is the old one or the new one, and never makes the others unreadable."""
+    """A name points to the old artefact or the new one, and other names stay readable."""
     store = Store(_created(tmp_path / "runs"))
     old = attempt(store).artefact
     new = store.publish(
@@ -173,7 +169,7 @@ def test_failing_call_at_every_step_of_publish(tmp_path, expected_id, number, pe
 
 
 def test_durable_before_visible(tmp_path):
-    """Page cache survives SIGKILL but no power cut, so the order of the calls is the promise."""
+    """The page cache survives SIGKILL but not a power cut, so the order of calls matters."""
     store = Store(_created(tmp_path / "runs"))
     output = stage_output(store, FILES, "out.0")
     log: list[tuple[str, str]] = []
@@ -271,7 +267,7 @@ def test_damaged_twin_is_replaced_not_trusted(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["symlink", "fifo"])
-def test_outputs_that_are_no_files_are_refused(tmp_path, kind):
+def test_outputs_other_than_plain_files_are_refused(tmp_path, kind):
     store = Store(_created(tmp_path / "runs"))
     output = stage_output(store, FILES, "out.0")
     if kind == "symlink":
@@ -285,7 +281,7 @@ def test_outputs_that_are_no_files_are_refused(tmp_path, kind):
 
 @pytest.mark.parametrize("other", [FILES, {"reward.pt": b"other"}], ids=["equal", "different"])
 def test_two_publishers_interleaved_at_every_step(tmp_path, other):
-    """Locks only save work: where flock does nothing, two processes publish one key at once.
+    """Two processes publish one key at once, as happens where flock has no effect.
 
     The second one publishes completely before the n-th call of the first.
     """
@@ -306,7 +302,7 @@ def test_two_publishers_interleaved_at_every_step(tmp_path, other):
         assert store.verify(store.ids()) == {}
         if won is None:
             break
-        # Whoever claimed the key first holds it, both know, and both results are there.
+        # The first claim holds the key, both processes report it, and both results are kept.
         holder = store.find(RECORD.key)
         assert holder is not None
         assert holder in (slow.artefact, slow.diverged)
@@ -316,7 +312,7 @@ def test_two_publishers_interleaved_at_every_step(tmp_path, other):
 
 
 def test_many_processes_publish_at_once(tmp_path):
-    """Half of them with different bytes: one holder, nothing partial, nothing lost."""
+    """Half of them with different bytes: one holds the key, and nothing is partial or lost."""
     store = Store(_created(tmp_path / "runs"))
     children = []
     for i in range(6):

@@ -1,18 +1,16 @@
-"""References and collection: what a person writes finds what it means, or nothing at all."""
+"""References: what a user writes finds one artefact or file, or nothing."""
 
 from __future__ import annotations
 
 import os
-import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from irlcli.errors import Busy, NotFound, UsageError
+from irlcli.errors import NotFound, UsageError
 from irlcli.store import Artefact, Store
-from irlcli.store.lock import is_locked, locked
 
 DAY = 86400.0
 
@@ -22,12 +20,7 @@ def artefact(empty_store, publish) -> Artefact:
     return publish(empty_store).artefact
 
 
-def outside(store: Store, artefact: Artefact) -> list[Path]:
-    """Everything in the store but the artefact itself, as a caller could reach it."""
-    return [p for p in store.root.rglob("*") if artefact.directory not in (p, *p.parents)]
-
-
-# Ways to write one
+# Forms of a reference
 
 
 @pytest.mark.parametrize("digits", [3, 4, 15, 16, 17, 63, 64])
@@ -44,8 +37,8 @@ def test_shorter_prefixes_name_nothing(empty_store, artefact, digits):
         empty_store.resolve(artefact.id[:digits])
 
 
-def test_long_prefix_that_goes_wrong_behind_the_directory_name(empty_store, artefact):
-    """The directory shows 16 digits; the rest of a 64-digit id counts too."""
+def test_a_long_prefix_that_differs_after_the_directory_name_finds_nothing(empty_store, artefact):
+    """The directory name has 16 digits; the other 48 are compared too."""
     last = "0" if artefact.manifest.id[-1] != "0" else "1"
     with pytest.raises(NotFound):
         empty_store.resolve(artefact.manifest.id[:-1] + last)
@@ -103,7 +96,7 @@ def test_an_existing_path_below_runs_is_that_file(tmp_path, publish, monkeypatch
     monkeypatch.chdir(tmp_path)
     found = store.resolve(f"runs/{other.id}/reward.pt")
     assert (found.artefact, found.path) == (None, Path(f"runs/{other.id}/reward.pt"))
-    # A prefix is no existing path.
+    # A path with a prefix does not exist.
     assert store.resolve(f"runs/{other.id[:5]}/reward.pt").artefact == artefact
 
 
@@ -142,7 +135,7 @@ def test_a_mistyped_name_below_runs_is_suggested(tmp_path, publish, monkeypatch)
 
 
 def test_ambiguity_names_the_candidates(empty_store, artefact):
-    """A second artefact with the same first digits, as 4096 artefacts are sure to bring."""
+    """Two artefacts with the same first digits: certain among 4097 for three digits."""
     twin = artefact.id[:6] + "0" * 10
     (empty_store.root / twin).mkdir()
     with pytest.raises(NotFound, match="ambiguous") as caught:
@@ -191,7 +184,7 @@ def test_unknown_output_is_suggested(empty_store, artefact):
 )
 @pytest.mark.parametrize("head", ["id", "prefix", "name"])
 def test_a_reference_never_leaves_its_artefact(empty_store, artefact, monkeypatch, head, rest):
-    """Neither by ``..`` nor to what is no output; with a bare head no path is normalised first."""
+    """Neither by ``..`` nor to files that are not outputs. A bare id or name is not normalised."""
     (empty_store.root.parent / "secret").write_bytes(b"secret")
     monkeypatch.chdir(empty_store.root.parent / "runs" / ".work")
     empty_store.set_name("best", artefact)
@@ -203,13 +196,13 @@ def test_a_reference_never_leaves_its_artefact(empty_store, artefact, monkeypatc
 @pytest.mark.parametrize(
     "inner", [".keys", ".names/best", "STORE", ".work", ".quarantine", ".locks/gc"]
 )
-def test_the_store_s_own_files_are_no_references(empty_store, artefact, inner):
+def test_the_store_s_own_files_cannot_be_referenced(empty_store, artefact, inner):
     empty_store.set_name("best", artefact)
     with pytest.raises(NotFound):
         empty_store.resolve(str(empty_store.root / inner))
 
 
-def test_foreign_files_are_taken_as_they_are(empty_store, artefact, tmp_path, monkeypatch):
+def test_files_outside_the_store_are_used_as_they_are(empty_store, artefact, tmp_path, monkeypatch):
     (tmp_path / "reward.pt").write_bytes(b"x")
     found = empty_store.resolve(str(tmp_path / "reward.pt"))
     assert (found.artefact, found.path, found.output) == (None, tmp_path / "reward.pt", None)
@@ -263,8 +256,8 @@ def test_any_text_is_found_or_refused(tmp_path_factory, ref):
     ],
     ids=ascii,
 )
-def test_what_cannot_be_a_name(empty_store, artefact, name):
-    """Above all what reads as an id: it would hide an artefact, now or later."""
+def test_invalid_names_are_refused(empty_store, artefact, name):
+    """Above all names that read as an id, which would hide an artefact."""
     with pytest.raises(UsageError) as caught:
         empty_store.set_name(name, artefact)
     assert repr(name) in caught.value.message and caught.value.hint
@@ -272,13 +265,13 @@ def test_what_cannot_be_a_name(empty_store, artefact, name):
 
 
 @pytest.mark.parametrize("name", ["ab", "best", "x" * 100, "Deadbeef", "a.b-c_1", "beefs"])
-def test_what_can_be_a_name(empty_store, artefact, name):
+def test_valid_names_are_accepted(empty_store, artefact, name):
     empty_store.set_name(name, artefact)
     assert empty_store.resolve(name).artefact == artefact
 
 
-def test_naming_rewrites_only_what_changes(empty_store, artefact, publish):
-    """Make's targets are names: touching one would rebuild all that follows."""
+def test_naming_again_leaves_the_file_alone(empty_store, artefact, publish):
+    """Names can be make targets: a newer file would rebuild everything after it."""
     empty_store.set_name("best", artefact)
     path = empty_store.root / ".names" / "best"
     os.utime(path, (1, 1))
@@ -291,14 +284,16 @@ def test_naming_rewrites_only_what_changes(empty_store, artefact, publish):
     assert empty_store.names() == {"best": other.id}
 
 
-def test_a_name_of_something_that_is_gone(empty_store, artefact):
+def test_the_name_of_a_missing_artefact_is_reported(empty_store, artefact):
     empty_store.set_name("best", artefact)
     artefact.directory.rename(empty_store.root / ".quarantine" / "gone")
     with pytest.raises(NotFound, match=f"'best' points to {artefact.id}, which is missing"):
         empty_store.resolve("best")
 
 
-def test_a_name_of_something_damaged_says_how_to_make_it_again(empty_store, artefact):
+def test_the_name_of_a_quarantined_artefact_comes_with_the_command_that_made_it(
+    empty_store, artefact
+):
     empty_store.set_name("best", artefact)
     output = next(artefact.directory / o.path for o in artefact.manifest.outputs)
     output.chmod(0o644)
@@ -312,169 +307,8 @@ def test_a_name_of_something_damaged_says_how_to_make_it_again(empty_store, arte
 
 
 @pytest.mark.parametrize("content", [b"", b"../../etc", b"\xff\xff", b"zzz"])
-def test_damaged_name_is_no_name(empty_store, artefact, content):
+def test_a_damaged_name_is_ignored(empty_store, artefact, content):
     (empty_store.root / ".names" / "best").write_bytes(content)
     assert empty_store.names() == {}
     with pytest.raises(NotFound):
         empty_store.resolve("best")
-
-
-# Ancestry and collection
-
-
-@pytest.fixture
-def family(empty_store, publish) -> dict[str, Artefact]:
-    """expert -> demos -> airl -> moved, beside a lonely one; all a year old."""
-    made: dict[str, Artefact] = {}
-
-    def make(name: str, *parents: str, whole: bool = False) -> None:
-        inputs = {
-            parent: made[parent].manifest.content if whole else made[parent].output("f").sha256
-            for parent in parents
-        }
-        files = {"f": name.encode(), "log": b"the same in all"}
-        made[name] = publish(empty_store, files, parameters={"of": name}, inputs=inputs).artefact
-
-    make("expert")
-    make("demos", "expert")
-    make("airl", "demos", whole=True)
-    make("moved", "airl")
-    make("lonely")
-    for artefact in made.values():
-        age(artefact.directory, 365)
-    return made
-
-
-def age(path: Path, days: float) -> None:
-    then = time.time() - days * DAY
-    os.utime(path, (then, then))
-
-
-def ids(*artefacts: Artefact) -> set[str]:
-    return {a.id for a in artefacts}
-
-
-def test_ancestors_are_found_by_content(empty_store, family):
-    found = empty_store.index().parents(family["airl"])
-    assert {role: [a.id for a in made] for role, made in found.items()} == {
-        "demos": [family["demos"].id]
-    }
-    assert empty_store.index().parents(family["expert"]) == {}
-
-
-def test_ancestor_that_is_not_in_the_store(empty_store, publish):
-    orphan = publish(empty_store, inputs={"reward": "0" * 64}).artefact
-    assert empty_store.index().parents(orphan) == {"reward": []}
-
-
-@pytest.mark.parametrize(
-    "named, kept",
-    [
-        ([], []),
-        (["moved"], ["expert", "demos", "airl", "moved"]),
-        (["demos"], ["expert", "demos"]),
-        (["lonely", "expert"], ["lonely", "expert"]),
-    ],
-)
-def test_names_and_their_ancestors_are_kept(empty_store, family, named, kept):
-    for name in named:
-        empty_store.set_name(f"name-{name}", family[name])
-    spared = ids(*(family[name] for name in kept))
-    everything = ids(*family.values())
-    assert ids(*empty_store.garbage(DAY)) == everything - spared
-    removed, _ = empty_store.collect(DAY)
-    assert ids(*removed) == everything - spared
-    assert set(empty_store.ids()) == spared
-    assert empty_store.verify(empty_store.ids()) == {}
-    for artefact in removed:
-        assert empty_store.find(artefact.manifest.record.key) is None
-    assert list((empty_store.root / ".work").iterdir()) == []
-
-
-def test_grace_period(empty_store, family):
-    age(family["lonely"].directory, 0)
-    age(family["moved"].directory, 2)
-    assert family["lonely"].id not in ids(*empty_store.garbage(DAY))
-    assert family["moved"].id in ids(*empty_store.garbage(DAY))
-    assert family["moved"].id not in ids(*empty_store.garbage(3 * DAY))
-    assert len(empty_store.garbage(400 * DAY)) == 0
-
-
-def test_clock_set_back_removes_nothing(empty_store, family):
-    """Artefacts from the future are young."""
-    for artefact in family.values():
-        age(artefact.directory, -1000)
-    assert empty_store.garbage(0) == []
-
-
-def test_dry_run_removes_nothing(empty_store, family):
-    def tree() -> list[tuple[str, int]]:
-        return sorted((str(p), p.lstat().st_mtime_ns) for p in empty_store.root.rglob("*"))
-
-    (empty_store.root / ".work" / ("a" * 64)).mkdir()
-    age(empty_store.root / ".work" / ("a" * 64), 365)
-    before = tree()
-    assert len(empty_store.garbage(DAY)) == 5
-    assert len(empty_store.stale_work(DAY)) == 1
-    assert tree() == before
-
-
-def test_collect_refuses_a_store_in_use(empty_store, family):
-    with empty_store.in_use(), pytest.raises(Busy):
-        Store(empty_store.root).collect(DAY)
-    assert len(empty_store.ids()) == 5
-    removed, _ = empty_store.collect(DAY)
-    assert len(removed) == 5
-
-
-def test_nobody_starts_while_collecting(empty_store):
-    gc_lock = locked(empty_store.root / ".locks" / "gc")
-    with gc_lock, pytest.raises(Busy) as caught, empty_store.in_use():
-        pytest.fail("used a store that gc was changing")
-    assert f"process {os.getpid()}" in caught.value.message and caught.value.hint
-
-
-def test_readers_share(empty_store):
-    with empty_store.in_use(), Store(empty_store.root).in_use():
-        assert not is_locked(empty_store.root / ".locks" / ("0" * 64))
-
-
-def test_one_key_one_worker(empty_store):
-    with empty_store.working_on("0" * 64, wait=False):
-        second = empty_store.working_on("0" * 64, wait=False)
-        with pytest.raises(Busy, match=f"process {os.getpid()}"), second:
-            pytest.fail("two workers on one key")
-        with empty_store.working_on("1" * 64, wait=False) as other:
-            other.save(b"state")
-    with empty_store.working_on("0" * 64, wait=False) as again:
-        assert again.load() is None  # the scratch of one key is not that of another
-
-
-def test_stale_work(empty_store):
-    """Only what is old and that nobody holds; a checkpoint of yesterday may be continued."""
-    for name in ("old", "held", "young"):
-        with empty_store.working_on(name, wait=False) as scratch:
-            scratch.save(b"state")
-    for name in ("old", "held"):
-        age(empty_store.root / ".work" / name, 30)
-    with empty_store.working_on("held", wait=False):
-        assert [p.name for p in empty_store.stale_work(7 * DAY)] == ["old"]
-        assert [p.name for p in Store(empty_store.root).collect(7 * DAY)[1]] == ["old"]
-    assert empty_store.has_checkpoint("held") and empty_store.has_checkpoint("young")
-    assert not empty_store.has_checkpoint("old")
-
-
-def test_collecting_goes_on_after_a_crash_in_the_middle_of_it(empty_store, family, publish):
-    """A gc that died left the half-emptied grave of an artefact, which was then made again."""
-    grave = empty_store.root / ".work" / f"removed-{family['lonely'].id}"
-    grave.mkdir()
-    (grave / "f").write_bytes(b"half")
-    removed, _ = empty_store.collect(DAY)
-    assert ids(*removed) == ids(*family.values())
-    assert empty_store.ids() == []
-
-
-def test_nothing_to_collect_in_a_store_that_is_not_there(tmp_path):
-    store = Store(tmp_path / "absent")
-    assert (store.garbage(0), store.stale_work(0), store.names(), store.ids()) == ([], [], {}, [])
-    assert store.collect(0) == ([], [])

@@ -1,4 +1,4 @@
-"""What processes that share a store owe each other: claims, collection, and newer versions."""
+"""Several processes, and several versions of the program, on one store."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DAY = 86400.0
 
 
 def to_newer_schema(directory: Path) -> None:
-    """As a later version might write it: another schema, another form, the same way of naming."""
+    """A manifest as a later version might write it: only contents are still named by sha256."""
     path = directory / "manifest.json"
     path.chmod(0o644)
     old = json.loads(path.read_bytes())
@@ -30,7 +30,7 @@ def to_newer_schema(directory: Path) -> None:
 
 @pytest.fixture
 def mixed(empty_store, publish):
-    """expert -> demos (named, of a newer schema), and a lonely one; all a year old."""
+    """expert -> demos (named, of a newer schema), and an unrelated one; all a year old."""
     expert = publish(empty_store, {"f": b"expert"}, parameters={"of": "expert"}).artefact
     inputs = {"expert": expert.output("f").sha256}
     demos = publish(empty_store, {"f": b"demos"}, parameters={"of": "demos"}, inputs=inputs)
@@ -42,7 +42,7 @@ def mixed(empty_store, publish):
     return expert.id, demos.artefact.id, lonely.id
 
 
-def test_a_newer_schema_is_left_out_by_name(irl, empty_store, mixed):
+def test_artefacts_of_a_newer_schema_are_skipped_with_a_warning(irl, empty_store, mixed):
     expert, newer, lonely = mixed
     root = empty_store.root
     for arguments in (["ls"], ["gc", "--grace-days", "0"], ["lineage", lonely], ["verify"]):
@@ -61,7 +61,7 @@ def test_a_newer_schema_is_left_out_by_name(irl, empty_store, mixed):
     assert list((root / ".quarantine").iterdir()) == []
 
 
-def test_gc_keeps_what_a_newer_version_made_and_made_use_of(irl, empty_store, mixed):
+def test_gc_keeps_artefacts_of_a_newer_schema_and_their_inputs(irl, empty_store, mixed):
     expert, newer, _ = mixed
     result = irl("gc", "--delete", "--grace-days", "0", "--store", empty_store.root)
     assert result.code == 0, result.err
@@ -71,7 +71,7 @@ def test_gc_keeps_what_a_newer_version_made_and_made_use_of(irl, empty_store, mi
         assert empty_store.collect(0.0) == ([], [])
 
 
-def test_verify_says_in_json_what_is_damaged(irl, empty_store, publish):
+def test_verify_reports_damage_as_json(irl, empty_store, publish):
     artefact = publish(empty_store).artefact
     sound = publish(empty_store, parameters={"seed": 1}).artefact
     path = artefact.directory / "reward.pt"
@@ -88,8 +88,8 @@ def test_verify_says_in_json_what_is_damaged(irl, empty_store, publish):
     assert Path(damage["quarantine"], "reward.pt").exists()
 
 
-def test_verify_says_what_is_missing(irl, empty_store, publish):
-    """What a name points to, and what something named was made from; nothing else."""
+def test_verify_reports_missing_artefacts(irl, empty_store, publish):
+    """Those that names point to, and the inputs of named artefacts; no others."""
     chain = []
     for name in ("expert", "demos", "reward"):
         inputs, places = {}, {}
@@ -119,7 +119,7 @@ def test_verify_says_what_is_missing(irl, empty_store, publish):
     collected = irl("gc", "--grace-days", "0", "--store", empty_store.root)
     assert collected.out.startswith(expert.id)
     assert line in collected.err
-    # Made again with other bytes, it has its name again; the reward's history stays lost.
+    # Computed again with other bytes, it has its name again; the reward's input stays missing.
     again = publish(empty_store, {"demos": b"other"}, parameters={"of": "again"}).artefact
     empty_store.set_name("demos", again)
     result = irl("verify", "--json", "--store", empty_store.root)
@@ -127,7 +127,7 @@ def test_verify_says_what_is_missing(irl, empty_store, publish):
     lost = {"names": [], "made": [reward.id], "command": None}
     assert json.loads(result.out)["missing"] == {demos.id: lost}
     assert f"warning: {demos.id} is missing: {reward.id} was made from it" in result.err
-    # What no name needs may go.
+    # Without a name that needs it, it is not missing.
     (empty_store.root / ".names" / "kept").unlink()
     result = irl("verify", "--json", "--store", empty_store.root)
     assert (result.code, json.loads(result.out)["missing"]) == (0, {})
@@ -156,7 +156,7 @@ def test_odd_provenance_leads_to_nothing_missing(irl, empty_store, monkeypatch, 
         assert irl(command, "--store", empty_store.root).code == 0
 
 
-def test_gc_goes_on_where_a_provenance_is_damaged(irl, empty_store, publish):
+def test_gc_works_although_a_provenance_is_damaged(irl, empty_store, publish):
     made = publish(empty_store, inputs={"input": "0" * 64}).artefact
     empty_store.set_name("damaged", made)
     path = made.directory / "provenance.json"
@@ -194,7 +194,7 @@ def manifests_read(monkeypatch) -> list[str]:
 
 @pytest.mark.parametrize("text", ["ls", "gc", "gc --delete", "lineage REF"])
 def test_each_manifest_is_read_once(irl, empty_store, publish, monkeypatch, text):
-    """Or once more for the artefact that is named on the command line."""
+    """Twice for the artefact that is named on the command line."""
     parent = None
     for seed in range(12):
         inputs = {} if parent is None else {"reward": parent.output("f").sha256}
@@ -211,7 +211,7 @@ def test_each_manifest_is_read_once(irl, empty_store, publish, monkeypatch, text
 
 @pytest.mark.parametrize("seed", range(6))
 def test_lineage_ends_where_content_leads_back(irl, empty_store, publish, seed):
-    """Whichever of the two comes first in the order of the ids."""
+    """Whichever of the two ids sorts first."""
     first = publish(empty_store, {"f": b"same"}, parameters={"seed": seed}).artefact
     inputs = {"reward": first.output("f").sha256}
     second = publish(
@@ -252,8 +252,8 @@ def staged(store: Store, name: str, data: bytes) -> Path:
     return output
 
 
-def test_a_claim_that_leads_nowhere_is_replaced_and_a_valid_one_never(empty_store, monkeypatch):
-    """Between the look at a stale claim and its removal, another process makes a valid one."""
+def test_a_claim_of_a_missing_artefact_is_replaced_but_never_a_valid_one(empty_store, monkeypatch):
+    """Another process makes a valid claim just before the stale one is removed."""
     store = empty_store
     pointer = store.root / ".keys" / RECORD.key
     pointer.write_text("0" * 16)
@@ -273,7 +273,7 @@ def test_a_claim_that_leads_nowhere_is_replaced_and_a_valid_one_never(empty_stor
 
 
 def test_a_damaged_holder_gives_up_its_claim(empty_store):
-    """The work just done is published, not thrown away with an error."""
+    """The new result is published instead of being lost to an error."""
     store = empty_store
     holder = store.publish(RECORD, staged(store, "one", b"one"), {}).artefact
     (holder.directory / "f").unlink()
@@ -284,7 +284,7 @@ def test_a_damaged_holder_gives_up_its_claim(empty_store):
 
 
 def test_what_was_repaired_meanwhile_is_not_set_aside(empty_store, publish, monkeypatch):
-    """Damage is seen; before it is moved, another process has put sound bytes in its place."""
+    """Another process replaces the damaged artefact just before it is moved."""
     store = empty_store
     artefact = publish(store).artefact
     path = artefact.directory / "reward.pt"
@@ -301,7 +301,7 @@ def test_what_was_repaired_meanwhile_is_not_set_aside(empty_store, publish, monk
     assert store.ids() == [artefact.id] and store.verify([artefact.id]) == {}
 
 
-def test_what_is_gone_is_not_called_damaged(empty_store, publish):
+def test_a_removed_artefact_is_missing_not_damaged(empty_store, publish):
     artefact = publish(empty_store).artefact
     while empty_store.ids():
         empty_store.collect(0.0)
@@ -336,7 +336,7 @@ def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monk
 
 @pytest.mark.parametrize("text", ["name {id} kept", "ls", "show {id}", "HIT --name kept"])
 def test_nothing_is_collected_while_a_command_uses_it(irl, store_copy, monkeypatch, text):
-    """gc asks at the last moment before the command ends."""
+    """gc tries to run just before the command ends."""
     from irlcli.cli import console
 
     store = Store(store_copy.path)
@@ -392,7 +392,7 @@ def test_a_command_waits_for_gc_to_end(irl, empty_store, publish):
     assert f"WAIT the store: process {pid}" in result.err
 
 
-def test_what_killed_processes_left_is_cleared_away(empty_store, publish):
+def test_leftovers_of_killed_processes_are_removed(empty_store, publish):
     """Temporary files of every kind, of a process that was killed while it wrote them."""
     key = "0" * 64
     pid = os.fork()
@@ -422,7 +422,7 @@ def test_what_killed_processes_left_is_cleared_away(empty_store, publish):
 
 
 def test_integrity_errors_of_a_store_without_its_empty_directories(empty_store, publish):
-    """A copy made by a program that leaves out empty directories is still a store."""
+    """Some copying programs leave out empty directories."""
     artefact = publish(empty_store).artefact
     (empty_store.root / ".quarantine").rmdir()
     (artefact.directory / "reward.pt").unlink()
@@ -443,7 +443,7 @@ def test_integrity_errors_of_a_store_without_its_empty_directories(empty_store, 
 def test_verify_survives_what_disappears_while_it_is_read(
     empty_store, publish, monkeypatch, module, call
 ):
-    """Another process collects the artefact between two looks at it: gone is not damaged."""
+    """An artefact that another process collects meanwhile is not damaged."""
     artefact = publish(empty_store).artefact
     original = getattr(module, call)
 

@@ -1,5 +1,5 @@
-"""Many processes at once: the work is done once, nobody sees a part of an artefact, and what is
-in use is not collected.
+"""Many processes at once: work is done once, artefacts are seen whole, and none in use is
+collected.
 
     python tests/torture/concurrency.py [--short]
 """
@@ -41,7 +41,7 @@ def compute(store: Store, record: KeyRecord, scratch: Scratch) -> Artefact:
 
 
 def fill(root: Path, keys: Iterable[int]) -> None:
-    """A store to copy from."""
+    """Publish artefacts in a store to copy from."""
     from irlcli.store import KeyRecord, Store
 
     store = Store(root)
@@ -53,7 +53,7 @@ def fill(root: Path, keys: Iterable[int]) -> None:
 
 
 def asker(root: Path, seed: int, rounds: int) -> None:
-    """Ask for one artefact after the other, as the runner does: find, copy or compute it."""
+    """Ask for random artefacts as the runner does: find, copy or compute each."""
     from irlcli.store import KeyRecord, Store
     from irlcli.store.sources import find_in, open_sources
 
@@ -82,7 +82,7 @@ def asker(root: Path, seed: int, rounds: int) -> None:
             if key < 2 and random.random() < 0.2:
                 store.set_name(f"name-{key}", found)
                 assert store.resolve(f"name-{key}/reward.pt").artefact == found
-        # gc needs a moment in which nobody holds the store.
+        # gc can only run while no process uses the store.
         time.sleep(random.expovariate(1 / 0.05))
 
 
@@ -112,7 +112,7 @@ def collector(root: Path) -> None:
 
 
 def checker(root: Path) -> None:
-    """Reads everything all the time; whatever it sees must be whole."""
+    """Verify everything again and again."""
     from irlcli.store import Store
 
     def work() -> None:
@@ -122,7 +122,7 @@ def checker(root: Path) -> None:
             index = store.index()
             for name in store.names().values():
                 assert name in index.artefacts
-        # A dry run of gc, and a verify, of somebody who does not know of the lock.
+        # Again without the lock, as on file systems without flock.
         store.garbage(0.0)
         store.stale_work(0.0)
         assert store.verify(store.ids()) == {}
@@ -148,7 +148,7 @@ def fork(work: Callable[[], None]) -> int:
 
 
 def store_alone(work: Path, rounds: int) -> dict[str, int]:
-    """Eight askers, two collectors, two checkers on one store."""
+    """Run eight askers, two collectors and two checkers on one store."""
     from irlcli.store import Store
 
     root = work / "runs"
@@ -179,7 +179,7 @@ def store_alone(work: Path, rounds: int) -> dict[str, int]:
 
 
 def commands_at_once(work: Path, processes: int) -> dict[str, int]:
-    """The same chain and overlapping ones through the command line, with gc and verify beside."""
+    """Run overlapping commands at once, with gc, verify and ls beside them."""
     from irlcli.store import Store
 
     root = work / "commands"
@@ -204,7 +204,7 @@ def commands_at_once(work: Path, processes: int) -> dict[str, int]:
         beside += 1
     ended = [must(child.wait()) for child in children]
     runs = Counter(label for e in ended for label in re.findall(r"^RUN (.*)$", e.err, re.M))
-    # Three experts, two datasets, one evaluation: each was made by one process only.
+    # Three experts, two datasets, one evaluation: each was computed by one process only.
     assert len(runs) == 6 and set(runs.values()) == {1}, runs
     assert len(set(ended[0].out.split() + ended[3].out.split())) == 1
     must(irl(root, "gc", "--delete", "--grace-days", "0"))
@@ -246,7 +246,7 @@ def table_row(work: Path) -> dict[str, int]:
 def main() -> None:
     short = "--short" in sys.argv
     preload()
-    signal.alarm(300 if short else 3600)  # a deadlock is a failure, too
+    signal.alarm(300 if short else 3600)  # ends a deadlock
     if not short:
         warm_up()
     with tempfile.TemporaryDirectory(prefix="irl-torture-") as name:

@@ -1,4 +1,4 @@
-"""Kill, refuse, fill the disk, set the clock back: the store stays whole, and a rerun ends in the
+"""Kills, failing calls, full disks, clocks set back: the store stays whole, and a rerun gives the
 same bytes.
 
     python tests/torture/crash.py [--short] [--part random ...]
@@ -28,7 +28,7 @@ _YEAR = 365 * 86400
 def killed_at_every_call(chain: Chain, stage: str, work: Path, stride: int) -> int:
     """SIGKILL at every ``stride``-th call that changes a file; returns the number of kills.
 
-    The rerun of each is killed, too, half as far on, and the one after that goes to the end.
+    The rerun after each kill is killed half as far in; the one after that completes.
     """
     kills = 0
     for n in range(0, _ENOUGH, stride):
@@ -48,7 +48,7 @@ def killed_at_every_call(chain: Chain, stage: str, work: Path, stride: int) -> i
 
 
 def killed_at_random(chain: Chain, stage: str, work: Path, wanted: int) -> tuple[int, int]:
-    """SIGKILL at random times, several in a row; returns kills and completed runs."""
+    """SIGKILL at random times, several per run; returns the numbers of kills and of completed runs."""
     random = seeded()
     kills = runs = 0
     while kills < wanted:
@@ -73,7 +73,7 @@ def killed_at_random(chain: Chain, stage: str, work: Path, wanted: int) -> tuple
 def refused_calls(
     chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool]
 ) -> int:
-    """One kind of call fails, once at a place or from there on; returns how often one did."""
+    """One kind of call fails, once or from a point on; returns the number of failed runs."""
     refused = 0
     for call, number in (
         ("fsync", errno.EIO),
@@ -100,7 +100,7 @@ def refused_calls(
 
 
 def clock_set_back(chain: Chain, stage: str, work: Path) -> int:
-    """A run is killed, the clock goes back or forth by a year, and the run goes on."""
+    """A run is killed, the clock is set back or forward by a year, and the run is resumed."""
     from irlcli.store import Store
 
     for clock in (-_YEAR, _YEAR):
@@ -117,7 +117,7 @@ def clock_set_back(chain: Chain, stage: str, work: Path) -> int:
         for artefact in Store(store).artefacts():
             origin = artefact.provenance()
             assert origin["seconds"] >= 0 and all(a["seconds"] >= 0 for a in origin["attempts"])
-        # What seems to come from the future is young, whatever leads to it.
+        # Artefacts dated in the future count as young, named or not.
         for name in (store / ".names").iterdir():
             name.unlink()
         if clock < 0:
@@ -128,7 +128,7 @@ def clock_set_back(chain: Chain, stage: str, work: Path) -> int:
 
 
 def full_disk(chain: Chain, stage: str, work: Path, stride: int) -> dict[str, int]:
-    """A file system of every size from nothing up to enough; then it gets larger.
+    """Run on file systems of increasing size until one suffices; enlarge each full one and rerun.
 
     Runs in a mount namespace of its own, where a tmpfs may be mounted.
     """
@@ -161,7 +161,7 @@ def full_disk(chain: Chain, stage: str, work: Path, stride: int) -> dict[str, in
 
 
 def in_mount_namespace(script: Path, arguments: list[str]) -> subprocess.CompletedProcess | None:
-    """This script again where it may mount; None if the system does not allow that."""
+    """Run this script in a mount namespace; None if the system does not allow it."""
     unshare = ["unshare", "--mount", "--map-root-user", "--user"]
     probe = [*unshare, "sh", "-c", "mount -t tmpfs tmpfs /tmp"]
     if shutil.which("unshare") is None or subprocess.run(probe, capture_output=True).returncode:
@@ -174,7 +174,7 @@ PARTS = ("random", "refused", "clock", "disk", "calls")
 
 
 def attack(part: str, chain: Chain, work: Path, short: bool) -> None:
-    """Do one of :data:`PARTS` and print its figures."""
+    """Run one of :data:`PARTS` and print its measurements."""
     stage = "train-maxent"
     if part == "calls":
         for each, stride in ((stage, 14),) if short else (("grid", 1), (stage, 6)):

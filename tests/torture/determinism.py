@@ -1,4 +1,4 @@
-"""Every stage twice, in surroundings that must not matter: the ids have to be the same.
+"""Every stage twice, under conditions that must not matter: the ids must be equal.
 
     python tests/torture/determinism.py [--env ant ...]
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 from irlcli.store import Store
 
-# Intervention learned from and setting transferred to.
+# Training intervention and unseen setting.
 ROBOTS = {
     "lunar-lander": ("engine-power=1x,1.25x", "engine-power=1.5x"),
     "ant": ("leg-length=1x,2x", "leg-length=3x"),
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--env", nargs="+", choices=[*ROBOTS, "gridworld"])
     chosen = parser.parse_args().env or [*ROBOTS, "gridworld"]
     differ = 0
-    # The second time runs elsewhere, where a checkout is found by its path alone.
+    # The second run has another current directory, so it needs the checkout's path.
     path = os.pathsep.join(filter(None, [os.getcwd(), os.environ.get("PYTHONPATH")]))
     for env in chosen:
         started = time.monotonic()

@@ -1,8 +1,8 @@
-/* Calls of libc that change files, refused or turned into a SIGKILL at a chosen one.
+/* Fails, or kills the process at, a chosen libc call that changes files.
  *
  * Loaded with LD_PRELOAD, so that the program under test, its libraries and the interpreter are
- * the real ones, down to the system call. Only calls on paths below `under` count. Steered by
- * faults_arm(), which a child calls after fork; idle until then.
+ * unmodified. Only calls on paths below `under` are counted. Inactive until a forked child calls
+ * faults_arm().
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>

@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of everything that reads what others wrote.
+"""Coverage-guided fuzzing of everything that reads files and text from users.
 
     python tests/torture/fuzz.py [--seconds 600] [--target NAME] [--seed 0]
 
@@ -38,7 +38,7 @@ TOKENS = (
 
 
 class Target(NamedTuple):
-    """Inputs to begin with, and what reads one."""
+    """Initial inputs, and the function that reads one."""
 
     seeds: Sequence[bytes]
     read: Callable[[bytes], object]
@@ -107,7 +107,7 @@ def _publish(store, files: dict[str, bytes], stage: str = "train-airl"):
 def references(place: Path) -> Target:
     from irlcli.store import Store
 
-    # One in the default place, and one elsewhere, in which runs/ID is found as well.
+    # The default store, and one elsewhere, in which runs/ID must be found too.
     stores = [Store(place / name) for name in ("runs", "elsewhere")]
     for store in stores:
         artefact = _publish(store, {"reward.pt": b"x"})
@@ -154,7 +154,7 @@ def manifests(place: Path) -> Target:
             try:
                 reader(place)
             except IrlError:
-                # Either must be refused by itself.
+                # One file being refused must not keep the other from being read.
                 continue
 
     return Target(seeds, read)
@@ -305,7 +305,7 @@ def mutate(data: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
 
 
 class Coverage:
-    """Which steps from line to line of the package an input takes, by ``sys.settrace``."""
+    """The steps from line to line of the package that an input takes (``sys.settrace``)."""
 
     def __init__(self):
         self.steps: set[tuple[str, int, int]] = set()
@@ -342,9 +342,9 @@ def _too_slow(*_: object) -> None:
 
 
 def fuzz(name: str, seconds: float, seed: int, place: Path) -> None:
-    """Fuzz one target; raises what it finds. The input at work lies in ``place``/input."""
+    """Fuzz one target; raises what it finds. The current input is in ``place``/input."""
     target = TARGETS[name](place)
-    # Torch and Arrow map far more than they use.
+    # Not smaller: Torch and Arrow map far more memory than they use.
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     signal.signal(signal.SIGALRM, _too_slow)
     rng, kept, seen = random.Random(seed), list(target.seeds), set()

@@ -1,4 +1,4 @@
-"""What commands cost as the store grows, and that a hit does not grow with it.
+"""What commands cost as the store grows; the cost of a hit must not grow.
 
 python tests/torture/growth.py [--short]
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from harness import HERE, figures
 
-_FAMILY = 4  # artefacts that descend from one another
+_FAMILY = 4  # length of a chain of artefacts made from one another
 _HIT = (
     *("evaluate", "--idle", "--env", "lunar-lander", "--intervention", "bounce=0.9"),
     *("--profile", "smoke", "--episodes", "1", "--name", "hit"),
@@ -63,7 +63,7 @@ def run(root: Path, *arguments: str) -> tuple[float, int, str]:
 
 
 def calls(root: Path, *arguments: str) -> dict[str, int]:
-    """System calls of a command by name, as strace counts them; of paths in the store only."""
+    """System calls of a command on paths in the store, by name, counted with strace."""
     line = ["strace", "-f", "-qq", "-y", "-o", "/dev/stdout", "-e", "trace=%file,%desc"]
     line += [sys.executable, "-B", "-m", "irlcli", *arguments, "--store", str(root)]
     done = subprocess.run(line, capture_output=True, text=True, cwd=HERE.parent.parent)
@@ -94,7 +94,7 @@ finally:
 
 
 def opened(root: Path, *arguments: str) -> str:
-    """What Python opens and lists below the store; where there is no strace."""
+    """Numbers of files that Python opens and directories that it lists in the store."""
     code = _AUDIT.format(root=str(root), arguments=[*arguments, "--store", str(root)])
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=HERE.parent.parent
@@ -139,7 +139,7 @@ def main() -> None:
                 figures(
                     f"growth, {size} artefacts", {"ms to publish": round(1e3 * filled, 1), **costs}
                 )
-        # Equal for every size: nothing is listed, and no file of another artefact is opened.
+        # Equal for all sizes: a hit lists no directory and opens no other artefact's files.
         assert len(hits) == 1 and "listdir" not in str(hits) and "scandir" not in str(hits), hits
         assert len(shows) == 1, shows
         assert len(traces) <= 1, traces

@@ -1,4 +1,4 @@
-"""What the torture scripts share: the real command line in children that can be broken.
+"""Shared by the torture scripts: the real command line in child processes with injected faults.
 
 A script re-runs itself with `faults.c` preloaded, loads the heavy libraries once, and forks a
 child for every command: the code under test is the product's own, from `main()` down to the system
@@ -25,13 +25,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent.parent))  # the tree that is tortured is the one they lie in
+sys.path.insert(0, str(HERE.parent.parent))  # test the checkout that contains this script
 SHIM = "IRL_TORTURE_SHIM"
-KILL = 0  # the shim's action that is no errno
+KILL = 0  # the shim's action; any other is an errno
 
 
 class Fault(NamedTuple):
-    """The call at which a child is broken; ``calls`` (names) are those that count, all if empty."""
+    """The call at which a fault is injected. Only ``calls`` (names) are counted; all if empty."""
 
     at: int = -1
     action: int = KILL
@@ -41,7 +41,7 @@ class Fault(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a child ended: exit code (negative: the signal), what it printed, calls that counted."""
+    """How a child ended: exit code (negative: the signal), stdout and stderr."""
 
     code: int
     out: str
@@ -49,7 +49,7 @@ class Ended(NamedTuple):
 
 
 def preload() -> None:
-    """Build the shim and start this script again under it, unless it is."""
+    """Build the shim and start this script again with it, unless it is loaded already."""
     if SHIM in os.environ:
         return
     if shutil.which("cc") is None:
@@ -63,12 +63,12 @@ def preload() -> None:
 
 
 def warm_up() -> None:
-    """Load what the stages load, so that children need not."""
+    """Load the libraries of the stages once, before forking."""
     import matplotlib  # noqa: F401
     import pyarrow.parquet  # noqa: F401
     import scipy.special  # noqa: F401
     import torch
-    import torch._dynamo  # by the first optimiser, a second of work
+    import torch._dynamo  # the first optimiser imports it, which takes a second
 
     torch.set_num_threads(1)
 
@@ -92,7 +92,7 @@ class Child:
             from irlcli.cli import main as cli
             from irlcli.experiments import runner
 
-            # The one liberty taken: stages that last a second must have checkpoints to lose.
+            # Smoke stages last a second: without this they would write no checkpoints.
             runner.Runner = functools.partial(runner.Runner, checkpoint_seconds=0.0)
             sys.argv = ["irl", *arguments]
             calls = f",{','.join(fault.calls)}," if fault.calls else ""
@@ -115,7 +115,7 @@ class Child:
             os._exit(code)
 
     def ended(self) -> bool:
-        """Whether it has ended, without waiting (and without reaping it)."""
+        """Whether it has ended. Neither waits for it nor reaps it."""
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def kill(self) -> None:
@@ -132,7 +132,7 @@ class Child:
 
 
 def irl(store: Path, *arguments: str, fault: Fault = Fault()) -> Ended:
-    """``irl ARGUMENTS`` in a child, to its end."""
+    """Run ``irl ARGUMENTS`` in a child process."""
     return Child(store, arguments, fault).wait()
 
 
@@ -158,12 +158,12 @@ STAGES: dict[str, tuple[str, ...]] = {
 
 
 def command(stage: str) -> list[str]:
-    """The command line of a stage, which names its artefact after itself."""
+    """The command line of a stage; its artefact is named after the stage."""
     return [*STAGES[stage], *SMOKE, "--name", stage]
 
 
 class Chain:
-    """Every stage run once undisturbed: what a store looks like before and after each."""
+    """A store before and after each stage of an undisturbed run."""
 
     def __init__(self, root: Path, stages: Sequence[str] = tuple(STAGES)):
         from irlcli.store import Store
@@ -182,7 +182,7 @@ class Chain:
             self.ids[stage] = Store(self.whole).ids()
 
     def fresh(self, stage: str, root: Path) -> Path:
-        """A store in which ``stage`` has everything it needs and has not run."""
+        """A copy of the store before ``stage``."""
         if root.exists():
             shutil.rmtree(root)
         if self.before[stage].exists():
@@ -190,7 +190,7 @@ class Chain:
         return root
 
     def assert_sound(self, stage: str, root: Path) -> None:
-        """Whatever happened: what readers see is whole, and is what it should be."""
+        """Whatever readers can see is whole, and equal to the undisturbed run."""
         from irlcli.store import Store
 
         if not (root / "STORE").exists():
@@ -202,7 +202,7 @@ class Chain:
         assert set(store.names().values()) <= set(ids)
 
     def assert_completes(self, stage: str, root: Path) -> None:
-        """The same command ends in the same bytes, and leaves nothing behind that gc would not."""
+        """The same command gives the same bytes, and gc removes all leftovers."""
         from irlcli.store import Store
 
         must(irl(root, *command(stage)))
@@ -220,12 +220,12 @@ class Chain:
 
 
 def figures(theme: str, values: dict[str, Any]) -> None:
-    """Print what was measured: a line each, and all of it as JSON for programs."""
+    """Print measurements, one per line, and then all of them as JSON."""
     for name, value in values.items():
         print(f"{theme}: {name}: {value}", flush=True)
     print(json.dumps({"theme": theme, **values}), flush=True)
 
 
 def seeded() -> random.Random:
-    """Random times that another run repeats, unless TORTURE_SEED says otherwise."""
+    """A random generator with the seed TORTURE_SEED, by default 0."""
     return random.Random(int(os.environ.get("TORTURE_SEED", "0")))

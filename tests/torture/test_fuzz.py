@@ -1,4 +1,4 @@
-"""The short form of fuzz.py: changed inputs are taken or refused by one of our errors.
+"""The short form of fuzz.py: mutated inputs are accepted, or refused with an error of our own.
 
 The long form follows coverage: ``make torture``.
 """
@@ -25,7 +25,7 @@ def target(request, tmp_path_factory):
 
 
 def test_what_fuzzing_begins_with_is_read(target):
-    """At least one sound input each, so that mutation begins inside the format."""
+    """Mutation starts from at least one valid input per target."""
     taken = []
     for data in target.seeds:
         try:

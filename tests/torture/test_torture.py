@@ -1,4 +1,4 @@
-"""The short forms of `make torture`, each script as a process of its own."""
+"""The short forms of `make torture`, each script in its own process."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 
 
 def short(name: str) -> dict:
-    """All figures of a script's short form."""
+    """All measurements of a script's short form."""
     done = subprocess.run(
         [sys.executable, str(HERE / f"{name}.py"), "--short"], capture_output=True, text=True
     )

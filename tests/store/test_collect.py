@@ -1,0 +1,173 @@
+"""Ancestry and garbage collection: what a name needs is kept, and what is in use or young."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from irlcli.errors import Busy
+from irlcli.store import Artefact, Store
+from irlcli.store.lock import is_locked, locked
+
+DAY = 86400.0
+
+
+@pytest.fixture
+def family(empty_store, publish) -> dict[str, Artefact]:
+    """expert -> demos -> airl -> moved, and an unrelated one; all a year old."""
+    made: dict[str, Artefact] = {}
+
+    def make(name: str, *parents: str, whole: bool = False) -> None:
+        inputs = {
+            parent: made[parent].manifest.content if whole else made[parent].output("f").sha256
+            for parent in parents
+        }
+        files = {"f": name.encode(), "log": b"the same in all"}
+        made[name] = publish(empty_store, files, parameters={"of": name}, inputs=inputs).artefact
+
+    make("expert")
+    make("demos", "expert")
+    make("airl", "demos", whole=True)
+    make("moved", "airl")
+    make("lonely")
+    for artefact in made.values():
+        age(artefact.directory, 365)
+    return made
+
+
+def age(path: Path, days: float) -> None:
+    then = time.time() - days * DAY
+    os.utime(path, (then, then))
+
+
+def ids(*artefacts: Artefact) -> set[str]:
+    return {a.id for a in artefacts}
+
+
+def test_ancestors_are_found_by_content(empty_store, family):
+    found = empty_store.index().parents(family["airl"])
+    assert {role: [a.id for a in made] for role, made in found.items()} == {
+        "demos": [family["demos"].id]
+    }
+    assert empty_store.index().parents(family["expert"]) == {}
+
+
+def test_ancestor_that_is_not_in_the_store(empty_store, publish):
+    orphan = publish(empty_store, inputs={"reward": "0" * 64}).artefact
+    assert empty_store.index().parents(orphan) == {"reward": []}
+
+
+@pytest.mark.parametrize(
+    "named, kept",
+    [
+        ([], []),
+        (["moved"], ["expert", "demos", "airl", "moved"]),
+        (["demos"], ["expert", "demos"]),
+        (["lonely", "expert"], ["lonely", "expert"]),
+    ],
+)
+def test_names_and_their_ancestors_are_kept(empty_store, family, named, kept):
+    for name in named:
+        empty_store.set_name(f"name-{name}", family[name])
+    spared = ids(*(family[name] for name in kept))
+    everything = ids(*family.values())
+    assert ids(*empty_store.garbage(DAY)) == everything - spared
+    removed, _ = empty_store.collect(DAY)
+    assert ids(*removed) == everything - spared
+    assert set(empty_store.ids()) == spared
+    assert empty_store.verify(empty_store.ids()) == {}
+    for artefact in removed:
+        assert empty_store.find(artefact.manifest.record.key) is None
+    assert list((empty_store.root / ".work").iterdir()) == []
+
+
+def test_grace_period(empty_store, family):
+    age(family["lonely"].directory, 0)
+    age(family["moved"].directory, 2)
+    assert family["lonely"].id not in ids(*empty_store.garbage(DAY))
+    assert family["moved"].id in ids(*empty_store.garbage(DAY))
+    assert family["moved"].id not in ids(*empty_store.garbage(3 * DAY))
+    assert len(empty_store.garbage(400 * DAY)) == 0
+
+
+def test_clock_set_back_removes_nothing(empty_store, family):
+    """Artefacts dated in the future count as young."""
+    for artefact in family.values():
+        age(artefact.directory, -1000)
+    assert empty_store.garbage(0) == []
+
+
+def test_dry_run_removes_nothing(empty_store, family):
+    def tree() -> list[tuple[str, int]]:
+        return sorted((str(p), p.lstat().st_mtime_ns) for p in empty_store.root.rglob("*"))
+
+    (empty_store.root / ".work" / ("a" * 64)).mkdir()
+    age(empty_store.root / ".work" / ("a" * 64), 365)
+    before = tree()
+    assert len(empty_store.garbage(DAY)) == 5
+    assert len(empty_store.stale_work(DAY)) == 1
+    assert tree() == before
+
+
+def test_collect_refuses_a_store_in_use(empty_store, family):
+    with empty_store.in_use(), pytest.raises(Busy):
+        Store(empty_store.root).collect(DAY)
+    assert len(empty_store.ids()) == 5
+    removed, _ = empty_store.collect(DAY)
+    assert len(removed) == 5
+
+
+def test_no_process_uses_the_store_while_it_is_collected(empty_store):
+    gc_lock = locked(empty_store.root / ".locks" / "gc")
+    with gc_lock, pytest.raises(Busy) as caught, empty_store.in_use():
+        pytest.fail("used the store while gc was changing it")
+    assert f"process {os.getpid()}" in caught.value.message and caught.value.hint
+
+
+def test_readers_share(empty_store):
+    with empty_store.in_use(), Store(empty_store.root).in_use():
+        assert not is_locked(empty_store.root / ".locks" / ("0" * 64))
+
+
+def test_one_key_one_worker(empty_store):
+    with empty_store.working_on("0" * 64, wait=False):
+        second = empty_store.working_on("0" * 64, wait=False)
+        with pytest.raises(Busy, match=f"process {os.getpid()}"), second:
+            pytest.fail("two workers on one key")
+        with empty_store.working_on("1" * 64, wait=False) as other:
+            other.save(b"state")
+    with empty_store.working_on("0" * 64, wait=False) as again:
+        assert again.load() is None  # the scratch of one key is not that of another
+
+
+def test_stale_work(empty_store):
+    """Only old directories that no process holds; yesterday's checkpoint can be resumed."""
+    for name in ("old", "held", "young"):
+        with empty_store.working_on(name, wait=False) as scratch:
+            scratch.save(b"state")
+    for name in ("old", "held"):
+        age(empty_store.root / ".work" / name, 30)
+    with empty_store.working_on("held", wait=False):
+        assert [p.name for p in empty_store.stale_work(7 * DAY)] == ["old"]
+        assert [p.name for p in Store(empty_store.root).collect(7 * DAY)[1]] == ["old"]
+    assert empty_store.has_checkpoint("held") and empty_store.has_checkpoint("young")
+    assert not empty_store.has_checkpoint("old")
+
+
+def test_collecting_works_after_an_interrupted_collection(empty_store, family, publish):
+    """A killed gc left a half-removed artefact, which has since been computed again."""
+    grave = empty_store.root / ".work" / f"removed-{family['lonely'].id}"
+    grave.mkdir()
+    (grave / "f").write_bytes(b"half")
+    removed, _ = empty_store.collect(DAY)
+    assert ids(*removed) == ids(*family.values())
+    assert empty_store.ids() == []
+
+
+def test_a_store_that_does_not_exist_has_nothing_to_collect(tmp_path):
+    store = Store(tmp_path / "absent")
+    assert (store.garbage(0), store.stale_work(0), store.names(), store.ids()) == ([], [], {}, [])
+    assert store.collect(0) == ([], [])
