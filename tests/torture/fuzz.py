@@ -2,11 +2,11 @@
 
     python tests/torture/fuzz.py [--seconds 600] [--target NAME] [--seed 0]
 
-Inputs that reach new lines of irlcli are kept and mutated further, byte by byte. Every input must be
-taken or refused by one of the program's own errors: anything else, and an input that takes longer than
-ten seconds, is a finding. Each target runs in a process of its own, with 8 GiB of address space, so
-that a crash or a bomb is a finding as well. Prints executions, lines reached and inputs kept;
-exits 1 with the input where something was found.
+Inputs that reach new lines of irlcli are kept and mutated further. Every input must be accepted, or
+refused with one of the program's own errors; anything else is a finding, and so is an input that
+takes longer than ten seconds. Each target runs in its own process with 8 GiB of address space, so
+crashes and decompression bombs are findings too. Prints executions, lines reached and inputs kept;
+exits 1 and prints the input if there is a finding.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ def target(request, tmp_path_factory):
     os.chdir(before)
 
 
-def test_what_fuzzing_begins_with_is_read(target):
+def test_the_initial_inputs_are_read(target):
     """Mutation starts from at least one valid input per target."""
     taken = []
     for data in target.seeds:
@@ -38,7 +38,7 @@ def test_what_fuzzing_begins_with_is_read(target):
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32), rounds=st.integers(1, 3))
-def test_changed_inputs_are_taken_or_refused(target, seed, rounds):
+def test_mutated_inputs_are_accepted_or_refused(target, seed, rounds):
     rng = random.Random(seed)
     data = rng.choice(target.seeds)
     for _ in range(rounds):

@@ -28,14 +28,14 @@ needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="faults.c needs
 
 
 @needs_cc
-def test_killed_refused_and_with_another_clock():
+def test_kills_failing_calls_and_changed_clocks():
     found = short("crash")
     kills = sum(number for name, number in found.items() if "kills" in name)
     assert kills >= 6 and found["refused calls"] >= 6 and found["clocks set"] == 2
 
 
 @needs_cc
-def test_many_processes_with_gc_and_verify_beside():
+def test_many_processes_beside_gc_and_verify():
     found = short("concurrency")
     assert (
         found["requests"] == 800
