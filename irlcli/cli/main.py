@@ -1,5 +1,6 @@
 """The entry point ``irl``: exit codes and one-line errors."""
 
+import atexit
 import gc
 import signal
 import sys
@@ -27,8 +28,9 @@ def main() -> None:
 
 def _main() -> None:
     # A light command mostly imports, which leaves no garbage. The runner enables the collector
-    # again before it runs a stage.
+    # again before it runs a stage. Frozen, what was imported is not searched for garbage at exit.
     gc.disable()
+    atexit.register(gc.freeze)
     console.prepare_streams()
     try:
         import typer
