@@ -98,7 +98,9 @@ def other_versions(origin: Mapping[str, Any]) -> list[str]:
     The version of irlcli is left out: a change of its code that alters results raises the stage's
     version, and with it the key.
     """
-    recorded = dict(origin.get("libraries") or {})
+    recorded = origin.get("libraries")
+    if not isinstance(recorded, dict):
+        recorded = {}
     return differing({**recorded, "irlcli": libraries()["irlcli"]})
 
 

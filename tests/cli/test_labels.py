@@ -1,11 +1,13 @@
 """Labels of artefacts and plans, and flags of single commands."""
 
+import json
 import shutil
 
 import pytest
 
 from irlcli.cli import console
 from irlcli.errors import UsageError
+from irlcli.experiments import provenance
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
@@ -83,3 +85,24 @@ def test_a_missing_tensorboard_is_reported_before_training(monkeypatch, irl, sto
     assert "pip install tensorboard" in done.err and "RUN" not in done.err
     with pytest.raises(UsageError):
         console.TerminalConsole(tensorboard=tmp_path)
+
+
+def test_show_names_libraries_that_have_changed_since(irl, smoke_store, monkeypatch):
+    line = ["show", "airl", "--store", smoke_store.path]
+    same = irl(*line, "--json")
+    assert json.loads(same.out)["other_versions"] == []
+    present = provenance.libraries()
+    monkeypatch.setattr(provenance, "libraries", lambda: {**present, "torch": "99.0"})
+    text = f"torch {present['torch']} (now 99.0)"
+    other = irl(*line, "--json")
+    assert json.loads(other.out)["other_versions"] == [text]
+
+
+def test_evaluations_print_their_returns_as_json(irl, store_copy):
+    line = ["evaluate", "--policy", "moved", "--ood", "1.5x", *SMOKE, "--store", store_copy.path]
+    document = json.loads(irl(*line, "--json").out)
+    reported = json.loads(
+        irl("report", "returns", "score", "--store", store_copy.path, "--json").out
+    )
+    assert document["id"] == store_copy.evaluation
+    assert document["returns"] == reported["rows"] and len(document["returns"]) == 1
