@@ -43,8 +43,7 @@ def main() -> None:
 def _irl(arguments: list[str]) -> str:
     """The code of the console script ``irl``, run on ``arguments``."""
     return (
-        f"import sys; sys.argv = {['irl', *arguments]!r}\n"
-        "from irlcli.cli.main import main; main()"
+        f"import sys; sys.argv = {['irl', *arguments]!r}\nfrom irlcli.cli.main import main; main()"
     )
 
 
