@@ -173,7 +173,7 @@ def test_no_worker_outlives_its_parent(stop, tmp_path):
         os.killpg(parent.pid, stop)  # as Ctrl-C in a terminal does
     else:
         os.kill(parent.pid, stop)
-    parent.wait(timeout=20)
+    parent.wait(timeout=120)
     assert wait_for_death(pids)
     assert "Process" not in parent.stderr.read()
     parent.stdout.close()

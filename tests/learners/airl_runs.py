@@ -33,7 +33,7 @@ def make(
         demos,
         config,
         worlds=len(worlds),
-        horizon=environment(env).max_episode_steps,
+        horizon=horizon,
         observation_size=worlds.observation_space.shape[0],
         actions=action_space(worlds.action_space),
         seed=seed,

@@ -12,7 +12,9 @@ from irlcli.learners import airl
 from irlcli.rl.loop import LastRound, Training
 from irlcli.trajectories import join
 
-LONG = PPOConfig(n_envs=8, n_steps=1100, batch_size=512, n_epochs=1)
+# A round holds whole episodes at this time limit.
+HORIZON = 200
+LONG = PPOConfig(n_envs=8, n_steps=220, batch_size=512, n_epochs=1)
 IRM = {"grouping": "per-setting", "penalty": "irmv1", "penalty_weight": 10.0}
 
 
@@ -22,7 +24,7 @@ def demos():
 
 
 def updated(demos, rounds=1, **changes):
-    trainer, learner = make(demos, ppo=LONG, **changes)
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, **changes)
     for index in range(rounds):
         rollouts = trainer.train_round(index, learner)
         rows = learner.update(index, rollouts, trainer.policy)
@@ -108,7 +110,7 @@ def test_unequal_counts_weigh_as_the_grouping_says(demos):
     """One episode against three: pooled by count, otherwise equally."""
     few = [demos[0][:1], demos[1][:3]]
     for grouping, weights in (("pooled", [1.0]), ("balanced", [0.5, 0.5])):
-        _, learner = make(few, ppo=LONG, grouping=grouping)
+        _, learner = make(few, ppo=LONG, horizon=HORIZON, grouping=grouping)
         assert learner._weights.tolist() == weights
 
 
@@ -148,7 +150,12 @@ def test_a_resumed_run_equals_an_uninterrupted_one(demos, bc_epochs):
 
     def training():
         trainer, learner = make(
-            demos, ppo=LONG, bc_epochs=bc_epochs, total_steps=3 * 8 * 1100, **IRM
+            demos,
+            ppo=LONG,
+            horizon=HORIZON,
+            bc_epochs=bc_epochs,
+            total_steps=3 * LONG.n_envs * LONG.n_steps,
+            **IRM,
         )
         return Training(trainer, learner, learner, LastRound(), ["one", "other"])
 
