@@ -21,11 +21,20 @@ def random_episodes(count, env=LANDER, settings=SETTINGS):
 
 
 def make(
-    demos, config=CONFIG, env=LANDER, settings=SETTINGS, seed=0, total_steps=10_000, **changes
+    demos,
+    config=CONFIG,
+    env=LANDER,
+    settings=SETTINGS,
+    seed=0,
+    total_steps=10_000,
+    horizon=None,
+    **changes,
 ):
-    """A trainer and a learner of ``demos`` in ``settings``."""
+    """A trainer and a learner of ``demos`` in ``settings``, both with the time limit ``horizon``."""
     config = replace(config, **changes)
+    horizon = horizon or environment(env).max_episode_steps
     worlds = make_worlds(env, settings[: len(demos)], config.ppo.n_envs)
+    worlds.max_episode_steps = horizon
     trainer = PPOTrainer(
         worlds, config.ppo, total_steps, seed, "test", keep_moments=config.bc_epochs > 0
     )
