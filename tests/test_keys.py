@@ -269,6 +269,10 @@ IRRELEVANT = [
         {"airl.penalty_weight": 0.0},
         ["airl.penalty", *(f"airl.penalty_{name}" for name in PENALTY_FIELDS[1:])],
     ),
+    (expert, {"expert.ppo.net_arch": ()}, ["expert.ppo.activation"]),
+    (airl, {"airl.hidden": ()}, ["airl.activation"]),
+    # A ramp of 0 rounds, or of 1.
+    (airl, {"airl.penalty_ramp_rounds": 0}, ["airl.penalty_ramp_rounds"]),
     (airl, {"airl.grouping": "pooled"}, ["airl.pairing"]),
     (
         airl,

@@ -51,6 +51,8 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
         ppo = replace(ppo, sde_sample_freq=None)
     if ppo.ent_coef == 0.0:
         ppo = replace(ppo, ent_coef_schedule=_PPO.ent_coef_schedule)
+    if not ppo.net_arch:
+        ppo = replace(ppo, activation=_PPO.activation)
     # A minibatch is at most the whole rollout.
     return replace(ppo, batch_size=min(ppo.batch_size, max(2, ppo.n_envs * ppo.n_steps)))
 
@@ -80,6 +82,11 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         if airl.grouping == "per-setting":
             # Without a penalty the mean of the settings' risks is all there is.
             airl = replace(airl, grouping="balanced")
+    else:
+        # A ramp of no rounds is one of a single round.
+        airl = replace(airl, penalty_ramp_rounds=max(1, airl.penalty_ramp_rounds))
+    if not airl.hidden:
+        airl = replace(airl, activation=_AIRL.activation)
     if airl.grouping == "pooled":
         airl = replace(airl, pairing=_AIRL.pairing)
     if airl.replay_share == 0.0:

@@ -108,7 +108,9 @@ def sample_minibatch(
         return [getattr(pool, f.name)[rows] for f in fields(Minibatch)]
 
     def stacked(stratum: Stratum) -> list[torch.Tensor]:
-        earlier = round(stratum.count * past_share) if stratum.past else 0
+        # Even, so that the even and the odd samples hold as many past ones: the unbiased penalty
+        # multiplies their gradients.
+        earlier = 2 * round(stratum.count * past_share / 2) if stratum.past else 0
         generated = draw(stratum.policy, stratum.count - earlier)
         if earlier:
             (past,) = stratum.past

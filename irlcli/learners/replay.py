@@ -91,8 +91,9 @@ class Replay:
         """Continue from ``state_dict()``."""
         self._episodes = []
         for stored in state["settings"]:
-            ends = np.cumsum(stored["lengths"].numpy())
-            rows = [np.arange(end - n, end) for n, end in zip(stored["lengths"], ends, strict=True)]
+            lengths = stored["lengths"].numpy()
+            ends = np.cumsum(lengths)
+            rows = [np.arange(end - n, end) for n, end in zip(lengths, ends, strict=True)]
             if not rows:
                 self._episodes.append([])
                 continue

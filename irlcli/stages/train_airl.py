@@ -54,9 +54,9 @@ def request(
     ``metrics.parquet`` with one row per round and setting.
 
     Raises:
-        UsageError: a tabular environment, gSDE, worlds that the settings cannot share equally, a
-            penalty that needs more settings, or a selection by something that the demonstrations
-            do not hold.
+        UsageError: a tabular environment, gSDE, worlds that the settings cannot share equally,
+            minibatches too small for shuffled settings, or a selection by something that the
+            demonstrations do not hold.
     """
     check_tabular(env, "train-airl", wanted=False)
     if airl.ppo.use_sde:
@@ -72,6 +72,12 @@ def request(
         raise UsageError(
             f"{airl.ppo.n_envs} worlds cannot be shared equally by {trained} settings",
             f"--set airl.ppo.n_envs to a multiple of {trained}",
+        )
+    if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
+        raise UsageError(
+            f"airl.batch_size = {airl.batch_size} cannot hold an even number of samples of each of "
+            f"{trained} settings",
+            f"--set airl.batch_size={2 * trained} or more",
         )
     parameters = Parameters(
         environment=environment_key(env),
@@ -148,6 +154,11 @@ def run(job: Job) -> None:
             episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
         except ValueError as error:
             raise UsageError(str(error), "select by a setting, or record more episodes") from None
+    if airl.grouping == "shuffled" and (len(settings) == 1 or max(map(len, episodes)) == 1):
+        job.console.warn(
+            "shuffling changes nothing with one setting or with one demonstration of each: this is "
+            "no control"
+        )
     parsed = [parse_setting(env, text) for text in settings]
     with closing(make_worlds(env, parsed, airl.ppo.n_envs, job.workers)) as worlds:
         trainer = PPOTrainer(

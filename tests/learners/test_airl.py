@@ -1,6 +1,7 @@
 """Adversarial IRL: definitions, absorbing states in closed form, the optimal discriminator."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -187,6 +188,24 @@ def test_minibatch_layout_and_share_of_the_past():
         [[0] * 6 + [4] * 2, [2] * 8],
         [[1] * 6 + [5] * 2, [3] * 8],
     ]
+
+
+@pytest.mark.parametrize("count", [2, 6, 8, 78])
+def test_even_and_odd_samples_hold_as_many_past_ones(count):
+    """The unbiased penalty multiplies the gradients of the two halves."""
+    model = make_model()
+
+    def constant(value):
+        data = make_transitions(5)
+        observations = torch.full((5, 8), float(value))
+        pool = make_pool(model, data, torch.zeros(5), False)
+        return replace(pool, observations=observations)
+
+    stratum = Stratum(constant(0), constant(1), (constant(2),), count)
+    batch = sample_minibatch([[stratum, stratum]], torch.Generator().manual_seed(0), 0.5)
+    past = batch.observations[0, 0, :, 0] == 2
+    assert past[::2].sum() == past[1::2].sum()
+    assert abs(int(past.sum()) - count) <= 2
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5, 20.0])
