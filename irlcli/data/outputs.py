@@ -25,6 +25,11 @@ def write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n")
 
 
+def write_csv(path: Path, frame: Any) -> None:
+    """Write a pandas ``frame`` as CSV with six significant digits."""
+    frame.to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
+
+
 def write_metrics(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write ``metrics.parquet``: one row per round and setting."""
     write_table(pa.Table.from_pylist(list(rows)), directory / "metrics.parquet")

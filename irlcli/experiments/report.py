@@ -34,7 +34,7 @@ def request(plan: Plan, command: str) -> Request:
     cells, sources = _cells(plan)
     if not any(cell.run for cell in cells):
         raise NotFound(
-            f"{plan.lookup.store.root} holds no evaluation of {plan.table.name} with these settings",
+            f"{plan.lookup.store.root} holds no evaluation of {plan.table.name} with this config",
             f"`irl run {plan.table.name}` makes them. --profile, --set, --seeds and --methods must "
             "be those of the runs; `irl ls` lists what exists",
         )
@@ -71,7 +71,7 @@ def _experts(
 ) -> Request:
     if not any(cell.run for cell in cells if cell.agent == "expert"):
         raise NotFound(
-            f"{plan.lookup.store.root} holds no evaluation of an expert with these settings",
+            f"{plan.lookup.store.root} holds no evaluation of an expert with this config",
             f"`irl run {plan.table.name}` makes them. --profile and --set must be those of the runs",
         )
     configs = {row.env: plan.configs(row.env).expert for row in plan.table.rows}

@@ -163,6 +163,22 @@ def shown(true_return: float, progress: float | None) -> str:
     return f"return {true_return:.0f}" + ("" if no_progress else f" progress {progress:.0f}")
 
 
+def summary_of(setting: str, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+    """The means of ``trajectories`` in one setting, as ``summary.json`` has them."""
+    import numpy as np
+
+    returns = np.array([t.episode_return for t in trajectories])
+    progress = float(np.mean([t.progress for t in trajectories]))
+    return {
+        "setting": setting,
+        "episodes": len(returns),
+        "mean_return": float(returns.mean()),
+        "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
+        "mean_progress": None if np.isnan(progress) else progress,
+        "mean_length": float(np.mean([len(t) for t in trajectories])),
+    }
+
+
 def _report(job: Job, training: Training, newest: list[Row]) -> None:
     facts = {row["setting"]: shown(row["true_return"], row["progress"]) for row in newest}
     if "accuracy" in newest[0]:

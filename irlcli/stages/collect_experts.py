@@ -10,7 +10,16 @@ from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, parse_setting
 from irlcli.stages import train_expert
-from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key, shown
+from irlcli.stages.base import (
+    EnvironmentKey,
+    From,
+    Job,
+    Request,
+    Stage,
+    environment_key,
+    shown,
+    summary_of,
+)
 
 # Every episode is validated on its own when demonstrations are read.
 _MOST_EPISODES = 100_000
@@ -105,7 +114,7 @@ def run(job: Job) -> None:
         )
         job.warn_of_errors(text, trajectories)
         groups.append((setting, trajectories))
-        summary.append(_summary(text, trajectories))
+        summary.append(summary_of(text, trajectories))
         facts = {text: shown(summary[-1]["mean_return"], summary[-1]["mean_progress"])}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {
@@ -127,28 +136,12 @@ def run_tabular(job: Job) -> None:
     for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True)):
         trajectories = gridworlds.sample(text, p.gridworld, episodes, (p.seed, index))
         groups.append((parse_setting(p.environment.name, text), trajectories))
-        summary.append(_summary(text, trajectories))
+        summary.append(summary_of(text, trajectories))
         facts = {text: f"return {summary[-1]['mean_return']:.0f}"}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     metadata = {"experts": "value iteration", "gridworld": msgspec.to_builtins(p.gridworld)}
     write_demonstrations(job.output, p.environment.name, groups, metadata)
     write_json(job.output / "summary.json", {"env": p.environment.name, "settings": summary})
-
-
-def _summary(text: str, trajectories: Sequence[Any]) -> dict[str, Any]:
-    """One setting's expert in numbers."""
-    import numpy as np
-
-    returns = np.array([t.episode_return for t in trajectories])
-    progress = float(np.mean([t.progress for t in trajectories]))
-    return {
-        "setting": text,
-        "episodes": len(returns),
-        "mean_return": float(returns.mean()),
-        "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
-        "mean_progress": None if np.isnan(progress) else progress,
-        "mean_length": float(np.mean([len(t) for t in trajectories])),
-    }
 
 
 STAGE = Stage("collect-experts", 2, run)

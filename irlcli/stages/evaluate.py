@@ -20,6 +20,7 @@ from irlcli.stages.base import (
     Stage,
     environment_key,
     shown,
+    summary_of,
 )
 
 if TYPE_CHECKING:
@@ -152,24 +153,13 @@ def run(job: Job) -> None:
             }
             for k, t in enumerate(trajectories)
         ]
-        returns = np.array([t.episode_return for t in trajectories])
-        progress = float(np.mean([t.progress for t in trajectories]))
-        summary.append(
-            {
-                "setting": text,
-                "episodes": len(returns),
-                "mean_return": float(returns.mean()),
-                "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
-                "mean_progress": None if np.isnan(progress) else progress,
-                "mean_length": float(np.mean([len(t) for t in trajectories])),
-                "terminated": float(np.mean([t.terminated for t in trajectories])),
-            }
-        )
+        means = summary_of(text, trajectories)
+        means["terminated"] = float(np.mean([t.terminated for t in trajectories]))
         if learned_returns is not None:
-            summary[-1]["mean_learned_return"] = float(np.mean(learned_returns))
-        job.console.progress(
-            index + 1, len(p.settings), "settings", {text: shown(returns.mean(), progress)}
-        )
+            means["mean_learned_return"] = float(np.mean(learned_returns))
+        summary.append(means)
+        facts = {text: shown(means["mean_return"], means["mean_progress"])}
+        job.console.progress(index + 1, len(p.settings), "settings", facts)
     write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
     write_json(job.output / "summary.json", document | {"settings": summary})
 

@@ -67,6 +67,7 @@ def run(job: Job) -> None:
     import numpy as np
     import pandas as pd
 
+    from irlcli.data.outputs import write_csv
     from irlcli.envs.gridworld import tasks
     from irlcli.envs.gridworld.env import walls
     from irlcli.interventions import env_kwargs, parse_setting
@@ -101,9 +102,7 @@ def run(job: Job) -> None:
     maze = figure2.Maze(grid.size, paths, wall(p.settings), wall(p.unseen))
     drawn = [panel(variant, title) for variant, title in panels()]
     figure2.draw(job.output, maze, drawn, summary, figure2.curves(quality), p.seed)
-    summary.to_csv(
-        job.output / "figure2.csv", index=False, float_format="%.6g", lineterminator="\n"
-    )
+    write_csv(job.output / "figure2.csv", summary)
     m = p.shared
     facts = [
         f"Datasets: {summary['datasets'].iloc[0]}, seeds from {p.seed}, each with "

@@ -26,7 +26,7 @@ def run(job: Job) -> None:
     import pandas as pd
 
     from irlcli.data import descriptions
-    from irlcli.data.outputs import write_json
+    from irlcli.data.outputs import write_csv, write_json
     from irlcli.report import build, page, plots
     from irlcli.store import read_json
 
@@ -73,9 +73,9 @@ def run(job: Job) -> None:
         if (role := f"{row.name} {method} {seed} reward-learning") in learning
     }
     report = build.build(p, pd.DataFrame(points), episodes, rewards)
-    report.cells.to_csv(job.output / f"{p.kind}.csv", **_CSV)
-    report.points.to_csv(job.output / "seeds.csv", **_CSV)
-    report.comparisons.to_csv(job.output / "comparisons.csv", **_CSV)
+    write_csv(job.output / f"{p.kind}.csv", report.cells)
+    write_csv(job.output / "seeds.csv", report.points)
+    write_csv(job.output / "comparisons.csv", report.comparisons)
     write_json(job.output / f"{p.kind}.json", build.as_json(report))
     (job.output / "README.md").write_text(page.markdown(p, report))
     (job.output / f"{p.kind}.tex").write_text(page.latex(report))
@@ -84,5 +84,4 @@ def run(job: Job) -> None:
     (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, curves))
 
 
-_CSV = {"index": False, "float_format": "%.6g", "lineterminator": "\n"}
 STAGE = Stage("report", 9, run)

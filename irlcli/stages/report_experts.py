@@ -44,7 +44,7 @@ def run(job: Job) -> None:
     import pandas as pd
 
     from irlcli.data import descriptions
-    from irlcli.data.outputs import write_json
+    from irlcli.data.outputs import write_csv, write_json
     from irlcli.report import experts
     from irlcli.store import read_json
 
@@ -64,9 +64,7 @@ def run(job: Job) -> None:
     numbers = experts.summarise(p.cells, p.runs, p.steps, summaries)
     table = experts.text_table(numbers)
     caveats = experts.caveats(p.cells, numbers, p.bars)
-    numbers.to_csv(
-        job.output / "experts.csv", index=False, float_format="%.6g", lineterminator="\n"
-    )
+    write_csv(job.output / "experts.csv", numbers)
     write_json(job.output / "experts.json", {"tables": [table._asdict()], "caveats": caveats})
     (job.output / "README.md").write_text(experts.markdown(p.command, table, caveats))
     experts.draw(job.output, p.cells, learning)

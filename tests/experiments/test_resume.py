@@ -118,7 +118,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_exit_130(tmp_path):
         if "steps/s" in line or "/200," in line:
             break
     process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 130
     assert output == ""
     assert "checkpoint was written" in errors and "hint:" in errors

@@ -127,7 +127,7 @@ def test_what_exists_needs_no_process(uninterrupted, runs):
     errors = runs.run(store, *REWARDS, "--experiments", earlier.tables)
     assert "6 of 6 steps exist" in errors
     process = runs.start(store, *REWARDS, "--experiments", earlier.tables, "--json")
-    document = json.loads(process.communicate(timeout=60)[0])
+    document = json.loads(process.communicate(timeout=300)[0])
     assert (document["kind"], document["existed"], document["made"]) == ("run", 6, 0)
     assert runs.processes() == [] and earlier.log.read_bytes() == before
 
@@ -237,7 +237,7 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
         for _ in range(count):
             process.send_signal(signal.SIGINT)
             time.sleep(0.3)
-        out, errors = process.communicate(timeout=30)
+        out, errors = process.communicate(timeout=200)
         assert (process.returncode, out) == (130, "")
         assert "error: stopped: " in errors and "same command again" in errors
         computing = {line["pid"] for line in runs.lines()[begin:] if "computes" in line}
