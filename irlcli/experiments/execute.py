@@ -217,6 +217,7 @@ class _Execution:
                 self._display.start(name)
 
     def _copy(self, name: str) -> bool:
+        """Copy a step's artefact; if that fails, a process makes it, or waits for who is at it."""
         why = self._plan.step(name).why
         copied = self._runner.copy(self._plan.tasks[name].request, self._plan.lookup)
         self._plan.lookup.forget_missing()

@@ -5,12 +5,12 @@
 
 import gc
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from irlcli.errors import IntegrityError, Interrupted, StageFailed
+from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed
 from irlcli.experiments import provenance
 from irlcli.experiments.checkpoints import StageCheckpoints
 from irlcli.experiments.status import Lookup, Step, key_record, source_in, source_of
@@ -116,23 +116,25 @@ class Runner:
                 return self._run(request)
 
     def copy(self, request: Request, lookup: Lookup) -> Artefact | None:
-        """A verified copy from one of the sources; None if none has it, or only a damaged one.
+        """A verified copy from one of the sources.
 
-        Raises:
-            Busy: another process works on it and this runner does not wait.
+        None if none has it, or only a damaged one, or if another process works on it: this
+        method does not wait.
         """
         record = lookup.record(request)
         if record is None:
             return None
         with (
+            suppress(Busy),
             _file_errors_of(request.label),
-            self.store.working_on(record.key, self.wait, partial(self.console.wait, request.label)),
+            self.store.working_on(record.key, wait=False),
         ):
             artefact = self.store.find(record.key)
             if artefact is None:
                 copied = self._adopt(record)
                 artefact = None if copied is None else copied[0]
             return artefact
+        return None
 
     def name(self, name: str, artefact: Artefact) -> None:
         """Let ``name`` stand for ``artefact``, and warn if another one loses it: gc may take that."""

@@ -181,8 +181,9 @@ def episode_rows(
 ) -> list[Row]:
     """One row per setting: true return and length of the episodes that ended in this round.
 
-    Where no episode ended the values are NaN, not zero; so is the progress of an environment that
-    reports none.
+    Rounds that are not many times as long as an episode show more short episodes than the policy
+    has: long ones are cut at the end. Evaluations do not have this bias. Where no episode ended the
+    values are NaN, not zero; so is the progress of an environment that reports none.
     """
     of_world = world_settings(rollouts[0].terminated.shape[1], len(settings))
     rows = []

@@ -15,7 +15,12 @@ from pathlib import Path
 import pytest
 from test_architecture import loaded_by
 
+from irlcli.configs import load_config
+from irlcli.experiments.runner import Runner
+from irlcli.interventions import parse_settings
+from irlcli.stages import train_expert
 from irlcli.store import Store
+from irlcli.store.sources import open_sources
 
 TABLES = """
 [tiny]
@@ -314,3 +319,18 @@ def test_a_table_end_to_end(irl, smoke_store, tmp_path):
     assert second.out == done.out and "\nRUN" not in second.err
     assert "11 of 11 steps exist" in second.err
     assert loaded_by("run", *map(str, words)) == "LOADED []"
+
+
+def test_a_copy_does_not_wait_for_a_process_that_works_on_the_same_artefact(smoke_store, tmp_path):
+    """It may take hours, and `irl run` would not answer Ctrl-C meanwhile."""
+    (setting,) = parse_settings("lunar-lander", "engine-power=1x")
+    config = load_config("lunar-lander", "smoke")
+    request = train_expert.request("lunar-lander", setting, 0, config.expert_of(setting))
+    runner = Runner(tmp_path / "new", sources=open_sources([smoke_store.path], pytest.fail))
+    runner.store.create()
+    lookup = runner.lookup()
+    step = lookup(request)
+    assert step.status == "FOUND"
+    with runner.store.working_on(step.key, wait=False):
+        assert runner.copy(request, lookup) is None
+    assert runner.copy(request, lookup).id == smoke_store.expert
