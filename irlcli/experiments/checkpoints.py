@@ -1,15 +1,13 @@
 """Checkpoints of a stage at work: saved at intervals, and when a signal asks it to stop."""
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 from irlcli.errors import Interrupted
 from irlcli.experiments import provenance
+from irlcli.experiments.signals import stop_requests
 from irlcli.stages.base import Stage
 from irlcli.store import Scratch
 
@@ -76,14 +74,10 @@ class StageCheckpoints:
                 "stopped; a checkpoint was written", "run the same command again to resume"
             )
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
+    def listening(self) -> AbstractContextManager[None]:
         """Let SIGINT or SIGTERM request a stop at the end of the round; a second one stops at once."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
 
-        def handle(number: int, frame: FrameType | None) -> None:
+        def handle() -> None:
             if self.stop_requested:
                 raise KeyboardInterrupt
             self.stop_requested = True
@@ -91,9 +85,4 @@ class StageCheckpoints:
                 "stopping at the end of this round (repeat the signal to stop at once)"
             )
 
-        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+        return stop_requests(handle)

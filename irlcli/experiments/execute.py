@@ -9,14 +9,13 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
-from types import FrameType
 from typing import NamedTuple, Protocol
 
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.runner import Runner
+from irlcli.experiments.signals import stop_requests
 from irlcli.stages import choose_penalty
 from irlcli.store import Artefact
 
@@ -176,7 +175,7 @@ class _Execution:
         self._outcome.existed.extend(there)
         self._display.begin(len(self._plan.tasks), len(there))
         if self._waiting:
-            with self._listening():
+            with stop_requests(self._signal):
                 try:
                     self._loop()
                 finally:
@@ -217,7 +216,7 @@ class _Execution:
                 self._display.start(name)
 
     def _copy(self, name: str) -> bool:
-        """Copy a step's artefact; if that fails, a process makes it, or waits for who is at it."""
+        """Copy a step's artefact; otherwise a process makes it, or waits for another one."""
         why = self._plan.step(name).why
         copied = self._runner.copy(self._plan.tasks[name].request, self._plan.lookup)
         self._plan.lookup.forget_missing()
@@ -273,19 +272,6 @@ class _Execution:
                 child.stop(at_once=self._signals > 1)
         self._passed_on = min(self._signals, 2)
 
-    @contextmanager
-    def _listening(self) -> Iterator[None]:
-        """Let SIGINT or SIGTERM ask the processes to stop; a second one kills them."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def handle(number: int, frame: FrameType | None) -> None:
-            self._signals += 1
-
-        previous = {s: signal.signal(s, handle) for s in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+    def _signal(self) -> None:
+        """SIGINT or SIGTERM ask the processes to stop; a second one kills them."""
+        self._signals += 1
