@@ -53,9 +53,10 @@ lint: $(READY)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
-# The settings, one seed and about half the budget are those of settings/demo/lunar-lander.toml.
+# One seed; settings/demo/lunar-lander.toml has the budgets.
 demo: $(READY)
 	$(IRL) run demo $(OPTIONS) --out $(RESULTS)
+	@echo; echo "report: $(RESULTS)/README.md and $(RESULTS)/demo.html"
 	@echo; echo "what the retrained policy of AIRL-IRM was made from:"
 	@$(IRL) lineage --store $(STORE) $(or $(TAG),demo).lunar-lander.engine-power.irm.0.transfer
 
@@ -76,7 +77,8 @@ experts figure2: $(READY)
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 
 report-%: $(READY)
-	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(addprefix -,$(ENVIRONMENT))
+	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(addprefix -,$(ENVIRONMENT)) \
+	    --out results/$(or $(TAG),$(PROFILE))/$*$(addprefix -,$(ENVIRONMENT))
 
 # The values of settings/*.toml; needs no store.
 table2: $(READY)

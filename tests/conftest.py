@@ -64,6 +64,8 @@ def run_main(arguments: list[str]) -> Result:
         code = stop.code or 0
     finally:
         sys.argv = before
+        # The command line ignores it from its last message on; here the process lives on.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     return Result(code, out.getvalue(), err.getvalue())
 
 

@@ -13,6 +13,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from irlcli import __version__
 from irlcli.cli.console import print_data
+from irlcli.errors import UsageError
 
 # Command -> (module of this package, one-line help). The function has the command's name, with
 # underscores; its docstring is the help of the command itself.
@@ -49,7 +50,24 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
         name, _, rest = super().resolve_command(ctx, args)
-        return name, None if name is None else _load(name), rest
+        command = None if name is None else _load(name)
+        if command is not None:
+            _refuse_repeated(command, rest)
+        return name, command, rest
+
+
+def _refuse_repeated(command: Any, args: list[str]) -> None:
+    """Refuse an option of one value that is given twice: only its last value would count.
+
+    Raises:
+        UsageError: naming the option.
+    """
+    given = [arg.partition("=")[0] for arg in args]
+    for option in command.params:
+        if option.param_type_name != "option" or option.multiple or option.is_flag:
+            continue
+        if sum(given.count(flag) for flag in option.opts) > 1:
+            raise UsageError(f"{option.opts[0]} is given twice", f"give {option.opts[0]} once")
 
 
 def _load(name: str) -> Any:

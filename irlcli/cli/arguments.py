@@ -47,6 +47,11 @@ def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
                 f"write {text}=VALUE,VALUE",
             )
         return parse_settings(env, f"{text}={','.join(values)}")
+    if origin is None and not text[:1].isalpha():
+        raise UsageError(
+            f"{text!r} names no knob of {env}",
+            f"write KNOB={text}; {env} has: {', '.join(sorted(environment(env).knobs))}",
+        )
     if origin is None or text in environment(env).knobs or text[:1].isalpha():
         knob_of(env, text)
         raise UsageError(f"{text!r} names no value", f"write {text}=VALUE,VALUE")

@@ -1,6 +1,7 @@
 """``irl report``."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -16,9 +17,17 @@ from irlcli.cli.experiments import (
 )
 from irlcli.cli.options import Name, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.cli.tables import Choice, open_plan, print_report, report_json, report_of
+from irlcli.cli.tables import (
+    Choice,
+    check_out,
+    copy_outputs,
+    open_plan,
+    print_report,
+    report_json,
+    report_of,
+)
 from irlcli.envs.registry import ENVIRONMENTS
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import NotFound, UsageError, suggest
 from irlcli.store import Artefact
 
 _FORMS = ("text", "markdown", "latex")
@@ -52,6 +61,9 @@ def report(
         ),
     ] = None,
     file: TableFile = None,
+    directory: Annotated[
+        Path | None, typer.Option("--out", help="Directory to copy the report's files to.")
+    ] = None,
     name: Name = None,
 ) -> None:
     """Print or write a table or figure from stored results.
@@ -65,6 +77,7 @@ def report(
         "--choose-penalty": choose_penalty,
         "--experiments": file,
         "--format": form,
+        "--out": directory,
         "--name": name,
     }
     if kind != "returns" and refs:
@@ -87,7 +100,7 @@ def report(
             _check_kind(chosen)
             if form is not None:
                 raise UsageError(f"{kind} takes no --format", "omit --format")
-            _table(session, chosen, name)
+            _table(session, chosen, name, directory)
 
 
 def _check_kind(chosen: Choice) -> None:
@@ -106,9 +119,17 @@ def _refuse(kind: str, options: Mapping[str, Any], *allowed: str) -> None:
             raise UsageError(f"{kind} takes no {option}", taken)
 
 
-def _table(session: StageSession, chosen: Choice, name: str | None) -> None:
-    """The report on a table of ``settings/experiments.toml``."""
+def _table(session: StageSession, chosen: Choice, name: str | None, directory: Path | None) -> None:
+    """The report on a table of ``settings/experiments.toml``, from what exists."""
+    if directory is not None:
+        check_out(directory, session.store.root)
     plan = open_plan(session, chosen)
+    missing = [task for task in plan.tasks if not plan.exists(task)]
+    if plan.figure is not None and missing and not session.dry_run:
+        raise NotFound(
+            f"{session.store.root} lacks {len(missing)} of {len(plan.tasks)} steps of {chosen.table}",
+            f"`irl run {chosen.table}` makes them",
+        )
     request = report_of(session, chosen, plan)
 
     def details(artefact: Artefact) -> dict[str, Any]:
@@ -116,6 +137,8 @@ def _table(session: StageSession, chosen: Choice, name: str | None) -> None:
         return {} if text is None else {"report": text}
 
     for artefact in session.deliver([request], name, details):
+        if directory is not None:
+            copy_outputs(session, artefact, directory)
         if not session.as_json:
             print_report(session, artefact, chosen.table)
 

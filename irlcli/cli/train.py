@@ -78,8 +78,10 @@ def train_airl(
         if made is None:
             return
         path = session.store.open(made, "choice.json")
-        chosen = msgspec.convert(read_json(path), choice.Choice).chosen
-        session.console.say(f"lambda {chosen:g} was the best of {choose_penalty} ({path})")
+        found = msgspec.convert(read_json(path), choice.Choice)
+        chosen = found.chosen
+        tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
+        session.console.say(f"lambda {chosen:g} was the best of {choose_penalty}{tied} ({path})")
         airl = msgspec.structs.replace(airl, penalty_weight=chosen)
         basis["penalty choice"] = source_of(Resolved(made, path))
     session.deliver([airl_stage.request(source, env, settings, airl, seed, basis)], name)

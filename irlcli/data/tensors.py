@@ -73,6 +73,9 @@ def from_bytes(data: bytes) -> Any:
             # torch.save does not compress. Torch would unpack a zip bomb.
             if sum(entry.file_size for entry in archive.infolist()) > len(data):
                 raise ValueError("its entries are larger than the file")
+            # Torch does not compare checksums.
+            if (damaged := archive.testzip()) is not None:
+                raise ValueError(f"its entry {damaged!r} does not match its checksum")
         with warnings.catch_warnings(action="ignore"):
             # Torch warns of some malformed files before it refuses them.
             return torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")

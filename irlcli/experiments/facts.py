@@ -19,7 +19,9 @@ def runs(
     for artefact in sorted(artefacts, key=lambda a: a.id):
         origin = artefact.provenance()
         git = origin.get("git") or {}
-        versions = {"python": origin.get("python"), **(origin.get("libraries") or {})}
+        versions = dict(origin.get("libraries") or {})
+        # The commit tells which irlcli it was.
+        versions.pop("irlcli", None)
         name = digest(versions)[:8]
         libraries[name] = versions
         record = artefact.manifest.record

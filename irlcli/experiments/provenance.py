@@ -15,6 +15,8 @@ from typing import Any
 
 import msgspec
 
+import irlcli
+
 SCHEMA = 1
 _LIBRARIES = (
     "torch",
@@ -115,7 +117,7 @@ class Clock:
         self._started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         # The time of day may be set back.
         self._begin = time.monotonic()
-        self._git = git_state(Path(__file__).parent)
+        self._git = git_state(Path(irlcli.__file__).parent)
 
     def attempt(self) -> Attempt:
         """The attempt as it stands."""
@@ -129,8 +131,8 @@ def libraries() -> dict[str, str | None]:
     # Imported here and below: a hit does not need them, and importing takes longer than a hit.
     import platform
 
-    found = {name: _version(name) for name in ("irlcli", *_LIBRARIES)}
-    return {**found, "python": platform.python_version()}
+    found = {name: _version(name) for name in _LIBRARIES}
+    return {"irlcli": irlcli.__version__, **found, "python": platform.python_version()}
 
 
 def record(command: list[str], workers: int, attempts: tuple[Attempt, ...]) -> dict[str, Any]:
@@ -142,7 +144,7 @@ def record(command: list[str], workers: int, attempts: tuple[Attempt, ...]) -> d
         "command": command,
         "git": {"commit": last.commit, "dirty": last.dirty},
         "libraries": libraries(),
-        "platform": platform.platform(),
+        "platform": f"{platform.system()} {platform.machine()}",
         "device": "cpu",
         "workers": workers,
         "started": attempts[0].started,

@@ -42,7 +42,7 @@ class Comparison:
         difference: mean of x minus mean of y; None if either is empty.
         welch: two-sided p of Welch's test, the primary one.
         student: two-sided p of Student's test with equal variances, the paper's.
-        improvement: P(X > Y) + P(X = Y) / 2 over pairs of seeds.
+        improvement: P(X > Y) + P(X = Y) / 2 over pairs of seeds; None for a single seed.
         why: the reason for missing p-values; else empty.
     """
 
@@ -104,7 +104,8 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
     a, b = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if not len(a) or not len(b):
         return Comparison(None, None, None, None, "one of the two methods has no seed")
-    difference, improvement = float(a.mean() - b.mean()), probability_of_improvement(a, b)
+    difference = float(a.mean() - b.mean())
+    improvement = probability_of_improvement(a, b) if min(len(a), len(b)) > 1 else None
     if min(len(a), len(b)) < 2:
         why = "one seed has no variance; each method needs two"
     elif not np.ptp(a) and not np.ptp(b):

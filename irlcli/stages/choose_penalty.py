@@ -31,13 +31,15 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 class Choice(msgspec.Struct, frozen=True, kw_only=True):
     """``choice.json``: the mean true return in each left-out setting, and the weight chosen.
 
-    ``scores`` has one dict per weight, from the left-out setting to the true return.
+    ``scores`` has one dict per weight, from the left-out setting to the true return. ``ties`` is
+    the number of weights with the best mean; the smallest of them is chosen.
     """
 
     env: str
     weights: tuple[float, ...]
     scores: tuple[dict[str, float], ...]
     chosen: float
+    ties: int
 
 
 def request(
@@ -124,8 +126,9 @@ def run(job: Job) -> None:
         weights=p.weights,
         scores=tuple(scores),
         chosen=p.weights[means.index(max(means))],
+        ties=means.count(max(means)),
     )
     write_json(job.output / "choice.json", msgspec.to_builtins(choice))
 
 
-STAGE = Stage("choose-penalty", 2, run)
+STAGE = Stage("choose-penalty", 3, run)

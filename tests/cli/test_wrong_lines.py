@@ -20,7 +20,15 @@ WRONG = [
     ("report", 2, "kind"),
     ("report returns", 2, "refs"),
     ("report table9 score", 2, "table9"),
+    ("report figure2 --profile smoke", 3, "figure2"),
+    ("report returns score --out x", 2, "--out"),
     # Environments and interventions
+    (
+        "collect-experts --env lunar-lander --intervention bounce=0.1 --intervention friction=0.2",
+        2,
+        "--intervention is given twice",
+    ),
+    ("evaluate --idle --env lunar-lander --ood 1.5x", 2, "'1.5x' names no knob of lunar-lander"),
     ("collect-experts", 2, "--env"),
     ("collect-experts --env lunar-lander", 2, "--intervention"),
     ("collect-experts --env moon --intervention engine-power=1x", 2, "'moon'"),

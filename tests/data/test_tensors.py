@@ -69,3 +69,12 @@ def test_tensors_that_do_not_fit_the_description_are_refused(file):
         change(path, state=wrong)
         with pytest.raises(IntegrityError, match="do not fit its description"):
             loader(path)
+
+
+def test_a_flipped_bit_in_a_loose_file_is_found(tmp_path):
+    """Torch itself does not compare the archive's checksums."""
+    data = bytearray(to_bytes({"weights": torch.arange(1000, dtype=torch.float64)}))
+    place = bytes(data).index(torch.arange(1000, dtype=torch.float64).numpy().tobytes())
+    data[place + 100] ^= 1
+    with pytest.raises(ValueError, match="checksum"):
+        from_bytes(bytes(data))

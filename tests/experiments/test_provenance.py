@@ -260,3 +260,25 @@ def test_running_out_of_memory_says_nothing_about_a_file(irl, store_copy, tmp_pa
     assert result.code == 1
     assert "error: out of memory" in result.err and "hint: " in result.err
     assert "defect" not in result.err and "not a tensor file" not in result.err
+
+
+def test_changes_anywhere_in_the_package_are_recorded(tmp_path, monkeypatch):
+    """Also in a package beside the one that records them."""
+    import irlcli
+
+    package = tmp_path / "checkout" / "irlcli"
+    (package / "penalties").mkdir(parents=True)
+    for name in ("__init__.py", "penalties/none.py"):
+        (package / name).write_text("")
+    git = ["git", "-C", str(package.parent), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "first"]):
+        subprocess.run([*git, *arguments], check=True)
+    monkeypatch.setattr(irlcli, "__file__", str(package / "__init__.py"))
+    clean = provenance.Clock().attempt()
+    assert clean.commit is not None and clean.dirty is None
+    (package / "penalties" / "none.py").write_text("changed = True")
+    changed = provenance.Clock().attempt()
+    (package / "penalties" / "new.py").write_text("")
+    added = provenance.Clock().attempt()
+    assert clean.commit == changed.commit == added.commit
+    assert len({clean.dirty, changed.dirty, added.dirty}) == 3

@@ -157,7 +157,8 @@ def test_the_selected_round_is_on_record(chosen, run_irl):
     ],
 )
 def test_bad_input(smoke_store, run_irl, arguments, named, hint):
-    common = ["train-airl", "--demos", "demos", "--method", "irm", "--profile", "smoke"]
+    common = ["train-airl", "--demos", "demos", "--profile", "smoke"]
+    common += [] if "--method" in arguments else ["--method", "irm"]
     done = run_irl([*common, "--store", str(smoke_store.path), *arguments])
     assert done.code == 2
     assert done.out == ""
