@@ -129,9 +129,10 @@ def test_what_exists_needs_no_process(uninterrupted, runs):
     _, earlier = uninterrupted
     store = earlier.log.parent / "runs"
     before = earlier.log.read_bytes()
-    errors = runs.run(store, *REWARDS, "--experiments", earlier.tables)
+    runs.tables = earlier.tables
+    errors = runs.run(store, *REWARDS)
     assert "6 of 6 steps exist" in errors
-    process = runs.start(store, *REWARDS, "--experiments", earlier.tables, "--json")
+    process = runs.start(store, *REWARDS, "--json")
     document = json.loads(process.communicate(timeout=300)[0])
     assert (document["kind"], document["existed"], document["made"]) == ("run", 6, 0)
     assert runs.processes() == [] and earlier.log.read_bytes() == before

@@ -487,7 +487,8 @@ def test_make_passes_its_variables_on():
         line = ["make", "-n", "-C", str(ROOT), "-o", ".venv/.installed", *words]
         done = subprocess.run(line, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
-        return [text for text in done.stdout.splitlines() if "/irl " in text]
+        joined = done.stdout.replace("\\\n", " ")
+        return [text for text in joined.splitlines() if "/irl " in text]
 
     plain = commands("table1")
     until = ["--until experts", "--until rewards", "--until transfers", "--until returns"]
@@ -510,4 +511,6 @@ def test_make_passes_its_variables_on():
     assert commands("experts", "RESULTS=docs/results/experts")[0].endswith(
         "--out docs/results/experts"
     )
-    assert commands("report-table1")[0].endswith("--name standard.table1")
+    report = commands("report-table1")[0]
+    assert "--name standard.table1 " in report
+    assert report.endswith("--out results/standard/table1")

@@ -165,8 +165,11 @@ def test_a_changed_maze_or_horizon_is_no_stale_hit(monkeypatch, field):
 
 
 def test_figure_and_table(run, store):
+    made = run("run", "figure2")
+    assert made.code == 0, made.err
     first = run("report", "figure2", "--name", "fig")
     assert first.code == 0, first.err
+    assert first.out == made.out
     artefact = Path(first.out.strip())
     assert (artefact / "figure2.png").read_bytes()[:4] == b"\x89PNG"
     pdf = (artefact / "figure2.pdf").read_bytes()
@@ -198,7 +201,7 @@ def test_hits_load_nothing_heavy(run, demos, store):
     common = ["--profile", "smoke", "--store", str(store)]
     assert run("train-maxent", "--demos", "demos").code == 0
     assert loaded_by("train-maxent", "--demos", "demos", *common) == "LOADED []"
-    assert run("report", "figure2").code == 0
+    assert run("run", "figure2").code == 0
     assert loaded_by("report", "figure2", *common) == "LOADED []"
 
 
