@@ -21,15 +21,19 @@ from irlcli import stages
 from irlcli.configs import Config, InterventionConfig
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
+from irlcli.experiments.bank import Policies, bank
 from irlcli.interventions import parse_settings
 from irlcli.learners import LEARNERS
 from irlcli.penalties import PENALTIES
 from irlcli.rl import ALGORITHMS
 from irlcli.stages import (
+    assess,
     choose_penalty,
+    clone,
     collect_experts,
     evaluate,
     figure2,
+    record,
     sweep_maxent,
     train_airl,
     train_expert,
@@ -107,6 +111,27 @@ def score(config: Config, seed: int = 0) -> Request:
     return evaluate.request(ENV, [UNSEEN], config.evaluation, policy, seed=seed)
 
 
+def cloned(config: Config, seed: int = 0) -> Request:
+    return clone.request(From(demos(config)), ENV, SETTINGS, config, seed)
+
+
+def recorded(config: Config, seed: int = 0) -> Request:
+    policy = From(retrained(config), "policy.pt")
+    return record.request(ENV, UNSEEN, config.evaluation, policy, noise=0.5, seed=seed)
+
+
+def assessed(config: Config, seed: int = 0) -> Request:
+    policies = Policies(
+        clone=From(cloned(config), "policy.pt"),
+        student=From(airl(config), "policy.pt"),
+        reused={str(SETTINGS[0]): From(expert(config), "policy.pt")},
+        experts={},
+        retrained={str(UNSEEN): {"retrained": From(retrained(config), "policy.pt")}},
+    )
+    reward = From(airl(config), "reward.pt")
+    return assess.request(reward, ENV, bank(ENV, [UNSEEN], config, policies, seed))
+
+
 # Stage to its request, and to the sections and fields that its key depends on.
 REQUESTS = {
     "train-expert": (expert, ["expert"]),
@@ -119,6 +144,18 @@ REQUESTS = {
     "figure2": (figure, ["gridworld", "maxent", "figure2"]),
     "transfer": (retrained, ["expert", "demonstrations", "airl", "transfer"]),
     "evaluate": (score, ["expert", "demonstrations", "airl", "transfer", "evaluation"]),
+    "clone": (
+        cloned,
+        [
+            *("expert", "demonstrations", "clone", "airl.actions"),
+            *(f"airl.ppo.{name}" for name in clone.Network.__struct_fields__),
+        ],
+    ),
+    "record": (recorded, ["expert", "demonstrations", "airl", "transfer", "evaluation"]),
+    "assess": (
+        assessed,
+        ["expert", "demonstrations", "airl", "transfer", "evaluation", "clone", "assessment"],
+    ),
 }
 # Reports read evaluations that are named one by one; no config field reaches them otherwise.
 REPORTS = {"report", "report-experts"}
@@ -130,6 +167,8 @@ UNREAD = {
     "train-airl": ["airl.ppo.sde_sample_freq"],
     "transfer": ["airl.ppo.sde_sample_freq"],
     "evaluate": ["airl.ppo.sde_sample_freq"],
+    "record": ["airl.ppo.sde_sample_freq"],
+    "assess": ["airl.ppo.sde_sample_freq"],
     # Both are replaced: the weight by the candidates, the selection by the request above.
     "choose-penalty": [
         *("airl.ppo.sde_sample_freq", "airl.penalty_weight"),
@@ -338,6 +377,7 @@ def makers(request: Request) -> set[str]:
 MODULES: list[tuple[ModuleType, str]] = [
     *((m, "STAGE") for m in (train_expert, collect_experts, train_airl, choose_penalty, transfer)),
     *((m, "STAGE") for m in (evaluate, train_maxent, sweep_maxent, figure2)),
+    *((m, "STAGE") for m in (clone, record, assess)),
     (collect_experts, "TABULAR_STAGE"),
 ]
 

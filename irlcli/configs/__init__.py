@@ -3,6 +3,8 @@
 from irlcli.configs.load import PROFILES, check_profile, load_config
 from irlcli.configs.schema import (
     AIRLConfig,
+    AssessmentConfig,
+    CloneConfig,
     Config,
     DemonstrationConfig,
     EvaluationConfig,
@@ -18,6 +20,8 @@ from irlcli.configs.schema import (
 __all__ = [
     "PROFILES",
     "AIRLConfig",
+    "AssessmentConfig",
+    "CloneConfig",
     "Config",
     "DemonstrationConfig",
     "EvaluationConfig",

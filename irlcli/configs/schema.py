@@ -176,6 +176,22 @@ class EvaluationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     deterministic: bool = False
 
 
+class CloneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A behavioural clone of the demonstrations. Its network and actions are those of ``airl``."""
+
+    epochs: Count = 30
+
+
+class AssessmentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How ``irl assess`` measures a reward.
+
+    Attributes:
+        noise: the ladder on the clone: probabilities of a random action instead of its own.
+    """
+
+    noise: tuple[Fraction, ...] = (0.0, 0.1, 0.25, 0.5, 0.75)
+
+
 class GridworldConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The gridworld of paper Sec. 5.1. Part of a dataset's identity, and recorded with it.
 
@@ -231,6 +247,8 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     airl: AIRLConfig = AIRLConfig()
     transfer: TransferConfig = TransferConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    clone: CloneConfig = CloneConfig()
+    assessment: AssessmentConfig = AssessmentConfig()
     gridworld: GridworldConfig = GridworldConfig()
     maxent: MaxEntConfig = MaxEntConfig()
     figure2: Figure2Config = Figure2Config()

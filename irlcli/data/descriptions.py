@@ -26,7 +26,7 @@ from irlcli.interventions import parse_setting
 Size = Annotated[int, Meta(ge=1, le=4096)]
 Settings = Annotated[tuple[str, ...], Meta(min_length=1)]
 MethodName = Annotated[str, Meta(max_length=100)]
-Agent = Literal["expert", "student", "transfer", "random", "idle"]
+Agent = Literal["expert", "student", "transfer", "clone", "random", "idle"]
 
 
 class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -158,6 +158,87 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     policy: Subject
     reward: LearnedReward | None = None
     settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
+
+
+Verdict = Literal["retrained", "wrong reward", "optimisation fell short"]
+
+
+class Measured(Struct, frozen=True, kw_only=True):
+    """A mean over episodes and its standard error, None for a single episode."""
+
+    mean: Finite
+    error: Finite | None
+
+
+class Interval(Struct, frozen=True, kw_only=True):
+    """A number and its 95 % bootstrap interval."""
+
+    value: Finite
+    low: Finite
+    high: Finite
+
+
+class Agreement(Struct, frozen=True, kw_only=True):
+    """Correlations of learned with true return over ``policies``; None where undefined."""
+
+    policies: int
+    spearman: Interval | None
+    pearson: Interval | None
+
+
+class RegretSplit(Struct, frozen=True, kw_only=True):
+    """Why a retrained policy earns less than the setting's expert.
+
+    Attributes:
+        true_regret: true return of the expert minus the policy's.
+        learned_gap: learned return of the expert minus the policy's.
+        clear: whether the difference that decides the verdict exceeds two standard errors.
+    """
+
+    policy: str
+    true_regret: Measured
+    learned_gap: Measured
+    verdict: Verdict
+    clear: bool
+
+
+class BankEntry(Struct, frozen=True, kw_only=True):
+    """A policy of the bank in one setting: mean returns over episodes."""
+
+    policy: str
+    kind: str
+    setting: str
+    true: Measured
+    learned: Measured
+    progress: Finite | None
+
+
+class Assessed(Struct, frozen=True, kw_only=True):
+    """What a reward is worth in one setting, or in all together (``setting`` is then empty).
+
+    Attributes:
+        expert_minus_idle: learned reward per step, expert minus idle, in standard deviations of
+            g; None without an expert.
+        return_distance: episode-return correlation pseudometric (Gleave et al. 2021).
+        retrained: every policy retrained on the reward in this setting.
+    """
+
+    setting: str
+    overall: Agreement
+    lower_half: Agreement
+    expert_minus_idle: Measured | None = None
+    return_distance: Finite | None = None
+    retrained: tuple[RegretSplit, ...] = ()
+
+
+class Assessment(Struct, frozen=True, kw_only=True):
+    """``assessment.json``: a learned reward, measured on a bank of policies."""
+
+    env: str
+    reward: LearnedReward
+    settings: Annotated[tuple[Assessed, ...], Meta(min_length=1)]
+    pooled: Assessed | None
+    bank: tuple[BankEntry, ...]
 
 
 class SettingReturn(Struct, frozen=True, kw_only=True):

@@ -11,7 +11,7 @@ from irlcli.configs import Config
 from irlcli.errors import UsageError, closest
 from irlcli.experiments import rows
 from irlcli.experiments.rows import PHASES, Chosen, Configs, Task
-from irlcli.experiments.status import STATUSES, Lookup, Step
+from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
 from irlcli.stages.base import From, Request
 from irlcli.store import digest
@@ -141,10 +141,8 @@ class Plan:
         """The state of the step called ``name``; what it waits for is named as in the plan."""
         step = self.lookup(self.tasks[name].request)
         if step.status == "BLOCKED":
-            waiting = [n for n in self.needs[name] if not self.exists(n)]
-            shown = ", ".join(waiting[:3])
-            shown += f" and {len(waiting) - 3} more" if len(waiting) > 3 else ""
-            step = step._replace(why=f"waits for {shown}")
+            missing = [n for n in self.needs[name] if not self.exists(n)]
+            step = step._replace(why=waiting(missing))
         return step
 
     def exists(self, name: str) -> bool:

@@ -108,7 +108,7 @@ class Lookup:
         if record is None:
             sources = [s.request for s in request.inputs.values() if isinstance(s, From)]
             missing = [s.label for s in sources if self(s).artefact is None]
-            return Step("BLOCKED", label, f"waits for {', '.join(missing)}")
+            return Step("BLOCKED", label, waiting(missing))
         key = record.key
         there = self.store.peek(key)
         if there.artefact is not None:
@@ -131,6 +131,12 @@ class Lookup:
 
             self._elsewhere[key] = find_in(self._sources, key)
         return self._elsewhere[key]
+
+
+def waiting(missing: Sequence[str]) -> str:
+    """What a blocked step waits for: the first three of ``missing``, and how many more."""
+    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+    return f"waits for {', '.join(missing[:3])}{more}"
 
 
 def key_record(request: Request, inputs: Mapping[str, str]) -> KeyRecord:

@@ -32,11 +32,12 @@ _LEARNING = {
     "mean_abs_logit": "mean |logit|, fresh",
 }
 # Occurs nowhere else, so that a page can replace it by its own colour.
-_INK = "#010203"
+INK = "#010203"
 
 
 @contextmanager
-def _style(ink: str) -> Iterator[None]:
+def style(ink: str) -> Iterator[None]:
+    """The style of every plot here, drawn in ``ink``."""
     with plt.rc_context(
         {
             "text.color": ink,
@@ -56,7 +57,7 @@ def _style(ink: str) -> Iterator[None]:
         yield
 
 
-def _svg(figure: plt.Figure, name: str) -> str:
+def as_svg(figure: plt.Figure, name: str) -> str:
     """``figure`` as an SVG element that takes its ink from the surrounding text.
 
     Its ids start with ``name``, because one page holds several.
@@ -67,18 +68,18 @@ def _svg(figure: plt.Figure, name: str) -> str:
     plt.close(figure)
     text = buffer.getvalue()
     text = re.sub(r'( id="|url\(#|href="#)', rf"\g<1>{name}-", text[text.index("<svg") :])
-    return text.replace(_INK, "currentColor").strip()
+    return text.replace(INK, "currentColor").strip()
 
 
 def draw_points(directory: Path, p: Parameters, report: Report) -> str:
     """Write ``KIND.png`` and ``KIND.pdf``: every seed, the mean and its interval. Return the SVG."""
-    with _style("black"):
+    with style("black"):
         figure = _points(p, report)
         figure.savefig(directory / f"{p.kind}.png", dpi=130)
         figure.savefig(directory / f"{p.kind}.pdf", metadata={"CreationDate": None})
         plt.close(figure)
-    with _style(_INK):
-        return _svg(_points(p, report), "points")
+    with style(INK):
+        return as_svg(_points(p, report), "points")
 
 
 def _points(p: Parameters, report: Report) -> plt.Figure:
@@ -148,7 +149,7 @@ def learning_curves(p: Parameters, learning: Mapping[str, pd.DataFrame]) -> dict
     ``learning`` maps ``ROW METHOD SEED reward-learning`` (or ``transfer-learning``) to metrics.
     """
     found: dict[str, str] = {}
-    with _style(_INK):
+    with style(INK):
         for row in p.rows:
             for kind, what in (
                 ("reward-learning", "reward learning: the student, in distribution"),
@@ -161,7 +162,7 @@ def learning_curves(p: Parameters, learning: Mapping[str, pd.DataFrame]) -> dict
                     if (role := f"{row.name} {method} {seed} {kind}") in learning
                 }
                 if runs:
-                    found[f"{row.name}, {what}"] = _svg(_curves(p, runs), f"curves{len(found)}")
+                    found[f"{row.name}, {what}"] = as_svg(_curves(p, runs), f"curves{len(found)}")
     return found
 
 

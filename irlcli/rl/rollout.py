@@ -25,12 +25,14 @@ def roll_out(
     seed: int,
     purpose: str,
     deterministic: bool = False,
+    noise: float = 0.0,
     parallel: int = 16,
 ) -> list[Trajectory]:
     """``episodes`` whole episodes of ``policy`` (or ``"random"``, ``"idle"``) in one setting.
 
     Episode k starts from a state of its own, derived from (purpose, seed, k). The actions of
-    the ``parallel`` episodes that run together come from one generator.
+    the ``parallel`` episodes that run together come from one generator. With probability
+    ``noise`` an action is replaced by a uniformly random one (D-REX, Brown et al. 2019, Sec. 4).
 
     Raises:
         UsageError: the setting's observations are not those the policy was trained on.
@@ -46,13 +48,13 @@ def roll_out(
         worlds = [make(env, setting) for _ in batch]
         if isinstance(policy, Policy):
             require_observations(policy, worlds[0].observation_space, f"{env} {setting}")
-        trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, rng)
+        trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, noise, rng)
         for world in worlds:
             world.close()
     return trajectories
 
 
-def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Trajectory]:
+def _run_batch(worlds, policy, seeds, limit, deterministic, noise, rng) -> list[Trajectory]:
     observations = [[w.reset(seed=s)[0]] for w, s in zip(worlds, seeds, strict=True)]
     actions: list[list[Any]] = [[] for _ in worlds]
     rewards: list[list[float]] = [[] for _ in worlds]
@@ -69,6 +71,9 @@ def _run_batch(worlds, policy, seeds, limit, deterministic, rng) -> list[Traject
             chosen = _random_actions(space, len(active), rng)
         else:
             chosen = _idle_actions(space, len(active))
+        if noise > 0.0:
+            replaced = rng.random(len(active)) < noise
+            chosen[replaced] = _random_actions(space, len(active), rng)[replaced]
         still = []
         for i, action in zip(active, chosen, strict=True):
             observation, reward, terminated, truncated, info = worlds[i].step(action)

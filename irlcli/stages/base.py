@@ -18,6 +18,9 @@ from irlcli.envs.registry import environment
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
+    from irlcli.data.descriptions import Reward
+    from irlcli.learners.frozen import FrozenReward
+    from irlcli.learners.reward_model import RewardModel
     from irlcli.rl.loop import Row, Training
     from irlcli.trajectories import Trajectory
 
@@ -155,6 +158,33 @@ def run_training(job: Job, training: Training) -> list[Row]:
         job.checkpoints.offer(encoded)
 
     return training.run(after_round, job.console.warn)
+
+
+def frozen_reward(
+    where: EnvironmentKey, setting: str, model: RewardModel, origin: Reward
+) -> FrozenReward:
+    """The reward that was read from a ``reward.pt``, as it scores episodes in ``setting``.
+
+    Raises:
+        UsageError: the reward takes other observations or actions.
+    """
+    from contextlib import closing
+
+    from irlcli.envs.registration import make
+    from irlcli.interventions import parse_setting
+    from irlcli.learners.frozen import FrozenReward
+    from irlcli.rl.worlds import action_space, observation_size
+
+    with closing(make(where.name, parse_setting(where.name, setting))) as world:
+        return FrozenReward(
+            model,
+            origin,
+            horizon=where.max_episode_steps,
+            gamma=origin.network.gamma,
+            where=f"{where.name} {setting}",
+            observation_size=observation_size(world.observation_space),
+            actions=action_space(world.action_space),
+        )
 
 
 def shown(true_return: float, progress: float | None) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
@@ -19,6 +18,7 @@ from irlcli.stages.base import (
     Source,
     Stage,
     environment_key,
+    frozen_reward,
     shown,
     summary_of,
 )
@@ -94,10 +94,7 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_json
     from irlcli.data.parquet import write_table
     from irlcli.data.tensors import load_policy_file, load_reward_file
-    from irlcli.envs.registration import make
-    from irlcli.learners.frozen import FrozenReward
     from irlcli.rl.rollout import roll_out
-    from irlcli.rl.worlds import action_space, observation_size
 
     p: Parameters = job.parameters
     env = p.environment.name
@@ -118,16 +115,7 @@ def run(job: Job) -> None:
         setting = parse_setting(env, text)
         learned_returns = None
         if "reward" in job.inputs:
-            with closing(make(env, setting)) as world:
-                frozen = FrozenReward(
-                    model,
-                    learned,
-                    horizon=p.environment.max_episode_steps,
-                    gamma=learned.network.gamma,
-                    where=f"{env} {text}",
-                    observation_size=observation_size(world.observation_space),
-                    actions=action_space(world.action_space),
-                )
+            frozen = frozen_reward(p.environment, text, model, learned)
         trajectories = roll_out(
             env,
             setting,

@@ -6,7 +6,7 @@ import torch
 
 from irlcli.configs import PPOConfig
 from irlcli.data.tensors import from_bytes, to_bytes
-from irlcli.interventions import parse_settings
+from irlcli.interventions import parse_setting, parse_settings
 from irlcli.rl.policy import describe, load_policy
 from irlcli.rl.ppo import PPOTrainer, TrueReward
 from irlcli.rl.rollout import roll_out
@@ -155,6 +155,23 @@ def test_roll_out_is_reproducible_and_whole(agent):
         assert a.terminated != a.truncated
     if agent == "idle":
         assert all((t.actions == 0).all() for t in first)
+
+
+@pytest.mark.parametrize(
+    ("env", "knob"), [("lunar-lander", "bounce=0.1"), ("reacher", "gravity=1x")]
+)
+def test_noise_replaces_that_share_of_a_policys_actions(env, knob):
+    """The idle agent's actions are zero, so each of the others is one that was replaced."""
+    place = parse_setting(env, knob)
+    shares = []
+    for noise in (0.0, 0.25, 1.0):
+        episodes = roll_out(env, place, "idle", 4, 0, "test", noise=noise)
+        actions = np.concatenate([t.actions for t in episodes])
+        replaced = (actions != 0).reshape(len(actions), -1).any(-1)
+        shares.append(replaced.mean() / (0.75 if env == "lunar-lander" else 1.0))
+    assert shares[0] == 0.0
+    assert shares[1] == pytest.approx(0.25, abs=0.08)
+    assert shares[2] == pytest.approx(1.0, abs=0.12)
 
 
 def test_idle_episode_equals_gymnasiums():

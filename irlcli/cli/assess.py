@@ -1,0 +1,145 @@
+"""``irl assess``."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from irlcli.cli import arguments
+from irlcli.cli import console as out
+from irlcli.cli.options import Name, Seed, stage_command
+from irlcli.cli.session import StageSession
+from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured
+from irlcli.errors import UsageError
+from irlcli.experiments import bank, references
+from irlcli.interventions import parse_setting
+from irlcli.stages import assess as stage
+from irlcli.stages.train_airl import describe
+from irlcli.store import Artefact
+
+if TYPE_CHECKING:
+    from irlcli.stages.base import Source
+
+
+@stage_command
+def assess(
+    session: StageSession,
+    reward: Annotated[str, typer.Argument(help="Learned reward: reward.pt or its artefact.")],
+    ood: Annotated[
+        str | None,
+        typer.Option(help="Settings: VALUE,... of the reward's knob, KNOB=VALUE,... or KNOB."),
+    ] = None,
+    intervention: Annotated[
+        str | None,
+        typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (ID values). Default: trained in."),
+    ] = None,
+    demos: Annotated[
+        str | None,
+        typer.Option(help="Demonstrations for the ladder of noise. Default: the reward's own."),
+    ] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each policy.")] = None,
+    seed: Seed = 0,
+    name: Name = None,
+) -> None:
+    """Measure how well a learned reward ranks policies of mixed quality."""
+    if ood is not None and intervention is not None:
+        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    source, origin = references.tensor_file(session.store, reward, "reward")
+    env = origin.env
+    config = session.config(env, {"evaluation.episodes": episodes})
+    if ood is not None:
+        settings = arguments.named_settings(env, config, ood, "ood", origin)
+    elif intervention is not None:
+        settings = arguments.named_settings(env, config, intervention, "id", origin)
+    else:
+        settings = [parse_setting(env, text) for text in origin.settings]
+    finder = bank.Finder(session.store.index(), session.runner().lookup(), config)
+    shown, cloned = finder.demonstrations(source), origin.settings
+    if demos is not None:
+        shown, cloned = _given(session, demos, env)
+    policies = finder.policies(source, origin, settings, shown, cloned, seed)
+    if shown is None:
+        session.console.warn(
+            "no ladder of noise: the store does not hold what this reward was learned from; "
+            "name demonstrations with --demos"
+        )
+    missing = [str(s) for s in settings if str(s) not in policies.experts]
+    for text in missing:
+        session.console.warn(
+            f"no expert of {text} with this config, so no regret and no expert minus idle: "
+            f"`irl evaluate --expert --env {env} --intervention {text}` trains it"
+        )
+    request = stage.request(
+        source,
+        env,
+        bank.bank(env, settings, config, policies, seed),
+        f"{describe(origin.airl)} seed {origin.seed}",
+    )
+
+    def found(artefact: Artefact) -> Assessment:
+        return references.output(session.store, artefact, "assessment.json", Assessment)
+
+    import msgspec
+
+    artefacts = session.deliver(
+        [request], name, lambda artefact: {"assessment": msgspec.to_builtins(found(artefact))}
+    )
+    if artefacts and not session.as_json:
+        _print(found(artefacts[0]))
+
+
+def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[str, ...]]":
+    source, of, settings = references.demonstrations(session.store, demos)
+    if of != env:
+        raise UsageError(
+            f"{demos!r} are demonstrations of {of}, not of {env}",
+            "name demonstrations of the reward's environment",
+        )
+    return source, tuple(settings)
+
+
+def _print(assessment: Assessment) -> None:
+    """The bank, the correlations and the regret splits, as tables on stderr."""
+    rows: list[list[str]] = []
+    for s in assessment.settings:
+        here = [e for e in assessment.bank if e.setting == s.setting]
+        for e in sorted(here, key=lambda e: e.true.mean):
+            progress = "-" if e.progress is None else f"{e.progress:.1f}"
+            rows.append([e.setting, e.policy, _measured(e.true), progress, _measured(e.learned)])
+    columns = ["setting", "policy", "true return", "progress", "learned return"]
+    out.print_table(columns, rows, stderr=True)
+    columns = ["setting", "policies", "Spearman", "Pearson", "lower half", "Spearman", "Pearson"]
+    columns += ["expert - idle", "return distance"]
+    every = [*assessment.settings, *([assessment.pooled] if assessment.pooled else [])]
+    out.print_table(columns, [_ranked(s) for s in every], stderr=True)
+    splits: list[list[Any]] = [
+        [
+            s.setting,
+            r.policy,
+            _measured(r.true_regret),
+            _measured(r.learned_gap),
+            r.verdict + ("" if r.clear else " (within two standard errors)"),
+        ]
+        for s in assessment.settings
+        for r in s.retrained
+    ]
+    if splits:
+        columns = ["setting", "retrained policy", "true regret", "learned gap", "verdict"]
+        out.print_table(columns, splits, stderr=True)
+
+
+def _ranked(found: Assessed) -> list[str]:
+    cells = [found.setting or "all"]
+    for part in (found.overall, found.lower_half):
+        cells += [str(part.policies), _interval(part.spearman), _interval(part.pearson)]
+    gap, distance = found.expert_minus_idle, found.return_distance
+    cells.append("-" if gap is None else _measured(gap, 3))
+    return [*cells, "-" if distance is None else f"{distance:.2f}"]
+
+
+def _interval(found: Interval | None) -> str:
+    return "-" if found is None else f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+
+
+def _measured(found: Measured, digits: int = 1) -> str:
+    error = "" if found.error is None else f" ± {found.error:.{digits}f}"
+    return f"{found.mean:.{digits}f}{error}"

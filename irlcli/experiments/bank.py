@@ -1,0 +1,169 @@
+"""The bank of policies that a learned reward is assessed on: which there are, and where.
+
+Idle and random agents, a ladder of noise on a clone of the demonstrations, the reward's student,
+experts, and policies retrained on the reward. Nothing here trains an expert or a retrained policy:
+those that exist are measured.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from irlcli.configs import Config
+from irlcli.data.descriptions import Reward
+from irlcli.experiments.status import Lookup, source_in
+from irlcli.interventions import Setting, parse_setting
+from irlcli.stages import clone, record, train_expert
+from irlcli.stages.assess import Entry
+from irlcli.stages.base import From, Request, Source
+from irlcli.store import Artefact, Index
+
+
+class Policies(NamedTuple):
+    """The policies of a bank besides the idle and the random agent.
+
+    Attributes:
+        clone: of the demonstrations, for the ladder.
+        student: trained together with the reward.
+        reused: experts of other settings, by the setting each was trained in.
+        experts: each setting's own, by setting.
+        retrained: by the setting of the training, then by name.
+    """
+
+    clone: Source | From | None
+    student: Source | From | None
+    reused: Mapping[str, Source | From]
+    experts: Mapping[str, Source | From]
+    retrained: Mapping[str, Mapping[str, Source | From]]
+
+
+def bank(
+    env: str, settings: Sequence[Setting], config: Config, policies: Policies, seed: int = 0
+) -> dict[Entry, Request]:
+    """The entries of a bank in ``settings``, each with the request that records its episodes."""
+    found: dict[Entry, Request] = {}
+    for place in settings:
+        for name, kind, policy, noise in _members(str(place), config, policies):
+            entry = Entry(policy=name, kind=kind, setting=str(place))
+            found[entry] = record.request(
+                env,
+                place,
+                config.evaluation,
+                policy,
+                agent=kind if kind in ("idle", "random") else "policy",  # type: ignore[arg-type]
+                noise=noise,
+                seed=seed,
+                policy_label="" if policy is None else kind if noise else name,
+            )
+    return found
+
+
+def _members(
+    place: str, config: Config, policies: Policies
+) -> Iterator[tuple[str, str, Source | From | None, float]]:
+    """Name, kind, policy and noise of each member in ``place``."""
+    yield "idle", "idle", None, 0.0
+    yield "random", "random", None, 0.0
+    if policies.clone is not None:
+        for noise in dict.fromkeys(config.assessment.noise):
+            yield f"clone, noise {noise}", "clone", policies.clone, noise
+    if policies.student is not None:
+        yield "student", "student", policies.student, 0.0
+    for trained, expert in policies.reused.items():
+        if trained != place:
+            yield f"expert of {trained}", "reused", expert, 0.0
+    if place in policies.experts:
+        yield f"expert of {place}", "expert", policies.experts[place], 0.0
+    for name, policy in policies.retrained.get(place, {}).items():
+        yield name, "retrained", policy, 0.0
+
+
+class Finder:
+    """Looks for the policies of a bank in a store.
+
+    Args:
+        index: of the store.
+        lookup: of the store and of those to copy from.
+        config: under which experts are looked up.
+    """
+
+    def __init__(self, index: Index, lookup: Lookup, config: Config):
+        self._index = index
+        self._lookup = lookup
+        self._config = config
+
+    def demonstrations(self, reward: Source) -> Source | None:
+        """What ``reward`` was learned from, if it is in the store."""
+        maker = self._maker(reward)
+        return None if maker is None else self._input(maker, "demonstrations", None)
+
+    def policies(
+        self,
+        reward: Source,
+        origin: Reward,
+        settings: Sequence[Setting],
+        demos: Source | None,
+        cloned: Sequence[str],
+        seed: int = 0,
+    ) -> Policies:
+        """The policies that exist for a bank in ``settings``, and a clone that can be made.
+
+        Args:
+            reward: a ``reward.pt``.
+            origin: its description.
+            settings: of the bank.
+            demos: demonstrations for the clone; None for no ladder.
+            cloned: their settings that the clone imitates.
+            seed: of the clone.
+        """
+        env, maker = origin.env, self._maker(reward)
+        imitation = None
+        if demos is not None:
+            places = [parse_setting(env, text) for text in cloned]
+            request = clone.request(demos, env, places, self._config, seed)
+            imitation = From(request, "policy.pt")
+        demonstrated = self.demonstrations(reward)
+        experts = {}
+        for text in dict.fromkeys([*origin.settings, *map(str, settings)]):
+            expert = self._expert(env, text, demonstrated)
+            if expert is not None:
+                experts[text] = expert
+        return Policies(
+            clone=imitation,
+            student=None if maker is None else source_in(maker, "policy.pt"),
+            reused={text: experts[text] for text in origin.settings if text in experts},
+            experts=experts,
+            retrained={str(s): self._retrained(reward, str(s)) for s in settings},
+        )
+
+    def _maker(self, reward: Source) -> Artefact | None:
+        """The stored artefact of ``reward``, also of a copy outside the store."""
+        makers = [reward.artefact] if reward.artefact else self._index.holders(reward.sha256)
+        found = (a for a in makers if a.manifest.record.stage == "train-airl")
+        return next(found, None)
+
+    def _input(self, artefact: Artefact, role: str, output: str | None) -> Source | None:
+        sha = artefact.manifest.record.inputs.get(role)
+        holders = [] if sha is None else self._index.holders(sha)
+        return source_in(holders[0], output) if holders else None
+
+    def _expert(self, env: str, text: str, demos: Source | None) -> Source | From | None:
+        """The expert behind the demonstrations, or else the one that the config asks for."""
+        if demos is not None and demos.artefact is not None:
+            expert = self._input(demos.artefact, f"expert {text}", "policy.pt")
+            if expert is not None:
+                return expert
+        place = parse_setting(env, text)
+        request = train_expert.request(env, place, 0, self._config.expert_of(place))
+        return From(request, "policy.pt") if self._lookup(request).artefact is not None else None
+
+    def _retrained(self, reward: Source, place: str) -> dict[str, Source]:
+        found = {}
+        for artefact in self._index.artefacts.values():
+            record_ = artefact.manifest.record
+            if (
+                record_.stage == "transfer"
+                and record_.inputs.get("reward") == reward.sha256
+                and record_.parameters.get("setting") == place
+            ):
+                found[f"retrained {artefact.id[:8]}"] = source_in(artefact, "policy.pt")
+        return dict(sorted(found.items()))

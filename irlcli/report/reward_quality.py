@@ -1,0 +1,216 @@
+"""How well a learned reward ranks policies, and why a policy retrained on it falls short.
+
+The sample is a *bank*: policies of mixed quality, each with the true and the learned returns of the
+same episodes. Every function is pure: arrays in, numbers out. A number that is not defined is None.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import rankdata
+
+from irlcli.data.descriptions import (
+    Agreement,
+    Interval,
+    Measured,
+    RegretSplit,
+    Verdict,
+)
+
+# A retrained policy succeeds if its regret is within this share of what the expert earns above
+# the random agent.
+ALLOWED_REGRET = 0.1
+_RESAMPLES = 2000
+
+
+class Member(NamedTuple):
+    """A policy of the bank in one setting.
+
+    Attributes:
+        policy: its name; one policy has the same name in every setting.
+        kind: ``idle``, ``random``, ``clone`` (the ladder of noise), ``student``, ``expert`` (the
+            setting's own), ``reused`` (that of another setting) or ``retrained``.
+        true, learned: returns [n] of the same n episodes.
+        steps: [n], over which the learned return sums, absorbing ones included.
+        progress: mean over the episodes; None if the environment reports none.
+    """
+
+    policy: str
+    kind: str
+    setting: str
+    true: np.ndarray
+    learned: np.ndarray
+    steps: np.ndarray
+    progress: float | None = None
+
+
+class Judgement(NamedTuple):
+    """A verdict, and whether the difference that decides it exceeds two standard errors."""
+
+    verdict: Verdict
+    clear: bool
+
+
+def measured(sample: np.ndarray) -> Measured:
+    """Mean of ``sample`` [n] and its standard error; that of one episode is None."""
+    error = float(sample.std(ddof=1)) / math.sqrt(len(sample)) if len(sample) > 1 else None
+    return Measured(mean=float(sample.mean()), error=error)
+
+
+def difference(x: Measured, y: Measured) -> Measured:
+    """x - y of independent samples."""
+    errors = [m.error for m in (x, y) if m.error is not None]
+    return Measured(mean=x.mean - y.mean, error=math.hypot(*errors) if len(errors) == 2 else None)
+
+
+# Correlations
+
+
+def pearson(x: np.ndarray, y: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Pearson's r [...] of ``x`` and ``y`` [..., P] over the entries ``present`` [..., P].
+
+    NaN below two entries, or where one of the two is constant.
+    """
+    count = np.maximum(present.sum(-1, keepdims=True), 1)
+    # Subtracted first: a constant then has deviations of exactly zero.
+    a, b = (np.where(present, v - _first(v, present), 0.0) for v in (x, y))
+    a, b = (np.where(present, v - v.sum(-1, keepdims=True) / count, 0.0) for v in (a, b))
+    varies = (_span(x, present) > 0) & (_span(y, present) > 0)
+    scale = np.sqrt((a**2).sum(-1) * (b**2).sum(-1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(varies & (scale > 0), np.clip((a * b).sum(-1) / scale, -1, 1), np.nan)
+
+
+def spearman(x: np.ndarray, y: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Spearman's rho, as :func:`pearson`: Pearson's r of the ranks, ties at their mean."""
+    return pearson(_ranks(x, present), _ranks(y, present), present)
+
+
+def lower_half(true: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Which entries [..., P] are present and at or below the median of ``true``."""
+    if not present.any(-1).all():
+        return present
+    middle = np.nanmedian(np.where(present, true, np.nan), axis=-1, keepdims=True)
+    return present & (true <= middle)
+
+
+def _first(values: np.ndarray, present: np.ndarray) -> np.ndarray:
+    index = present.argmax(-1)[..., None]
+    return np.take_along_axis(np.broadcast_to(values, present.shape), index, -1)
+
+
+def _span(values: np.ndarray, present: np.ndarray) -> np.ndarray:
+    high = np.where(present, values, -np.inf).max(-1)
+    return high - np.where(present, values, np.inf).min(-1)
+
+
+def _ranks(values: np.ndarray, present: np.ndarray) -> np.ndarray:
+    # The absent ones rank last and so leave the others' ranks alone.
+    return rankdata(np.where(present, values, np.inf), axis=-1)
+
+
+def agreement(members: Sequence[Member], lower: bool = False, seed: int = 0) -> Agreement:
+    """Correlations of the mean learned with the mean true return over the bank.
+
+    The 95 % percentile intervals resample policies, with all their settings, and episodes within
+    them. With ``lower``, only over the half of the entries with the lower true returns; each
+    resample has its own lower half.
+
+    Args:
+        members: of one setting or of several; each has the same number of episodes.
+        lower: whether to leave the better half out.
+        seed: of the resampling.
+    """
+    policies = list(dict.fromkeys(m.policy for m in members))
+    settings = list(dict.fromkeys(m.setting for m in members))
+    episodes = len(members[0].true)
+    shape = len(policies), len(settings)
+    present = np.zeros(shape, dtype=bool)
+    true, learned = np.zeros((2, *shape, episodes))
+    for m in members:
+        at = policies.index(m.policy), settings.index(m.setting)
+        present[at], true[at], learned[at] = True, m.true, m.learned
+    rng = np.random.default_rng(seed)
+    drawn = rng.integers(shape[0], size=(_RESAMPLES, shape[0]))
+    at_random = rng.integers(episodes, size=(_RESAMPLES, *shape, episodes))
+
+    def resampled(values: np.ndarray) -> np.ndarray:
+        means = np.take_along_axis(values[drawn], at_random, -1).mean(-1)
+        return means.reshape(_RESAMPLES, -1)
+
+    def chosen(values: np.ndarray, here: np.ndarray) -> np.ndarray:
+        return lower_half(values, here) if lower else here
+
+    point = true.mean(-1).reshape(1, -1), learned.mean(-1).reshape(1, -1)
+    draws = resampled(true), resampled(learned)
+    here = chosen(point[0], present.reshape(1, -1))
+    there = chosen(draws[0], present[drawn].reshape(_RESAMPLES, -1))
+    return Agreement(
+        policies=int(here.sum()),
+        spearman=_interval(spearman(*point, here), spearman(*draws, there)),
+        pearson=_interval(pearson(*point, here), pearson(*draws, there)),
+    )
+
+
+def _interval(point: np.ndarray, draws: np.ndarray) -> Interval | None:
+    """None if undefined. A resample that is constant says nothing and is left out."""
+    if math.isnan(point[0]):
+        return None
+    low, high = np.nanpercentile(draws, [2.5, 97.5])
+    return Interval(value=float(point[0]), low=float(low), high=float(high))
+
+
+def return_distance(members: Sequence[Member]) -> float | None:
+    """Episode-return correlation pseudometric sqrt((1 - r) / 2) (Gleave et al. 2021, Sec. 5).
+
+    r is Pearson's over the episodes of the bank, each policy counting equally. 0: equal up to scale
+    and offset; 1: opposite. Unlike EPIC it depends on the policies.
+    """
+    true = np.concatenate([m.true for m in members])
+    learned = np.concatenate([m.learned for m in members])
+    r = float(pearson(true, learned, np.ones(len(true), dtype=bool)))
+    return None if math.isnan(r) else math.sqrt((1.0 - r) / 2.0)
+
+
+# What a retrained policy fell short of
+
+
+def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -> Judgement:
+    """Why a retrained policy does not earn what the expert earns, if it does not.
+
+    ``retrained``: its regret is within 10 % of what the expert earns above the random agent.
+    ``wrong reward``: its learned return is at least the expert's. ``optimisation fell short``: the
+    expert's learned return is higher, so the reward still offers more.
+
+    Args:
+        policy, expert, random: true returns.
+        gap: learned return of the expert minus the policy's.
+    """
+    regret = difference(expert, policy)
+    beyond = regret.mean - ALLOWED_REGRET * max(0.0, expert.mean - random.mean)
+    if beyond <= 0.0:
+        return Judgement("retrained", _is_clear(beyond, regret))
+    verdict: Verdict = "wrong reward" if gap.mean <= 0.0 else "optimisation fell short"
+    return Judgement(verdict, _is_clear(gap.mean, gap))
+
+
+def _is_clear(margin: float, of: Measured) -> bool:
+    return of.error is not None and abs(margin) > 2.0 * of.error
+
+
+def split_regret(policy: Member, expert: Member, random: Member) -> RegretSplit:
+    """The true regret of a retrained policy beside the gap of its learned return to the expert."""
+    earned, best, worst = (measured(m.true) for m in (policy, expert, random))
+    gap = difference(measured(expert.learned), measured(policy.learned))
+    verdict, clear = judge(earned, best, worst, gap)
+    return RegretSplit(
+        policy=policy.policy,
+        true_regret=difference(best, earned),
+        learned_gap=gap,
+        verdict=verdict,
+        clear=clear,
+    )

@@ -1,0 +1,120 @@
+"""A behavioural clone of demonstrations: the policy that noise turns into a ladder of quality."""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from irlcli.configs import Config
+from irlcli.configs.relevance import relevant_ppo
+from irlcli.configs.schema import Activation, CloneConfig, Finite, Widths
+from irlcli.envs.registry import environment
+from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.stages.base import (
+    EnvironmentKey,
+    From,
+    Job,
+    Request,
+    Source,
+    Stage,
+    environment_key,
+)
+
+
+class Network(msgspec.Struct, frozen=True, kw_only=True):
+    """The fields of ``airl.ppo`` that a policy which is never trained by PPO depends on."""
+
+    net_arch: Widths
+    activation: Activation
+    ortho_init: bool
+    normalise_observations: bool
+    log_std_init: Finite
+    log_std_max: Finite | None
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What a clone depends on, besides its demonstrations."""
+
+    environment: EnvironmentKey
+    settings: tuple[str, ...]
+    seed: int
+    actions: str
+    network: Network
+    clone: CloneConfig
+
+
+def request(
+    demos: Source | From, env: str, settings: Sequence[Setting], config: Config, seed: int = 0
+) -> Request:
+    """A policy cloned from those of ``demos`` that are of ``settings``.
+
+    Its network is that of the student (``airl.ppo``), and ``airl.actions`` says whether the
+    likelihood is that of sampled or of executed actions.
+
+    Outputs ``policy.pt`` and ``policy.json``.
+
+    Raises:
+        UsageError: a tabular environment, or an option that does not fit its actions.
+    """
+    check_tabular(env, "clone", wanted=False)
+    ppo = relevant_ppo(config.airl.ppo, environment(env).discrete_actions, "airl.ppo")
+    texts = tuple(str(s) for s in settings)
+    parameters = Parameters(
+        environment=environment_key(env),
+        settings=texts,
+        seed=seed,
+        actions=config.airl.actions,
+        network=Network(**{name: getattr(ppo, name) for name in Network.__struct_fields__}),
+        clone=config.clone,
+    )
+    label = f"clone {env} {', '.join(texts)} seed {seed}"
+    return Request(STAGE, parameters, {"demonstrations": demos}, label)
+
+
+def run(job: Job) -> None:
+    """Maximise the likelihood of the demonstrated actions."""
+    from contextlib import closing
+
+    from irlcli.configs import PPOConfig
+    from irlcli.data.demonstrations import read_demonstrations
+    from irlcli.data.outputs import write_policy
+    from irlcli.errors import IntegrityError
+    from irlcli.learners.actions import ActionView
+    from irlcli.learners.cloning import clone
+    from irlcli.rl.ppo import PPOTrainer
+    from irlcli.rl.worlds import action_space, make_worlds, observation_size
+    from irlcli.trajectories import transitions
+
+    p: Parameters = job.parameters
+    env = p.environment.name
+    demos = read_demonstrations(job.inputs["demonstrations"])
+    if demos.env != env or not set(p.settings) <= set(demos.trajectories):
+        raise IntegrityError(
+            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, but "
+            f"{env} {', '.join(p.settings)} is asked for"
+        )
+    # The trainer is only there for its policy: it never acts.
+    ppo = PPOConfig(n_envs=1, n_steps=2, batch_size=2, **msgspec.structs.asdict(p.network))
+    setting = parse_setting(env, p.settings[0])
+    episodes = [t for text in p.settings for t in demos.trajectories[text]]
+    with closing(make_worlds(env, [setting], 1)) as worlds:
+        trainer = PPOTrainer(worlds, ppo, 2, p.seed, STAGE.name, keep_moments=True)
+        space = action_space(worlds.action_space)
+        size = observation_size(worlds.observation_space)
+        view = ActionView(p.actions, space)
+        data = view.of(transitions(episodes, p.environment.max_episode_steps))
+        discrete = data.actions.ndim == 1
+        if data.observations.shape[1] != size or discrete != space.discrete:
+            raise IntegrityError(f"the demonstrations do not fit {env} {setting}")
+        clone(trainer, data, view, p.clone.epochs, p.seed)
+    write_policy(
+        job.output,
+        trainer.policy,
+        ppo,
+        env=env,
+        agent="clone",
+        settings=p.settings,
+        seed=p.seed,
+    )
+
+
+STAGE = Stage("clone", 1, run)

@@ -1,0 +1,115 @@
+"""Whole episodes of one policy in one setting, step by step: a member of a bank of policies.
+
+Any number of learned rewards can then score them without acting again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from irlcli.configs import EvaluationConfig
+from irlcli.errors import UsageError
+from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.stages import evaluate
+from irlcli.stages.base import (
+    EnvironmentKey,
+    From,
+    Job,
+    Request,
+    Source,
+    Stage,
+    environment_key,
+    shown,
+    summary_of,
+)
+
+if TYPE_CHECKING:
+    from irlcli.rl.policy import Policy
+
+
+class Parameters(msgspec.Struct, frozen=True, kw_only=True):
+    """What recorded episodes depend on, besides the policy."""
+
+    environment: EnvironmentKey
+    setting: str
+    agent: evaluate.Agent
+    noise: float
+    seed: int
+    evaluation: EvaluationConfig
+
+
+def request(
+    env: str,
+    setting: Setting,
+    evaluation: EvaluationConfig,
+    policy: Source | From | None = None,
+    agent: evaluate.Agent = "policy",
+    noise: float = 0.0,
+    seed: int = 0,
+    policy_label: str = "",
+) -> Request:
+    """Episodes of ``policy`` (a ``policy.pt``), or of the random or idle agent, in ``setting``.
+
+    They are the episodes of :func:`irlcli.stages.evaluate.request` with the same arguments. With
+    probability ``noise`` an action is replaced by a uniformly random one.
+
+    Outputs ``steps.parquet``, ``episodes.parquet`` and ``summary.json``.
+
+    Raises:
+        UsageError: a tabular environment, a policy missing or too many, or noise on no policy.
+    """
+    check_tabular(env, "record", wanted=False)
+    if (agent == "policy") != (policy is not None) or (noise and agent != "policy"):
+        raise UsageError(
+            f"agent {agent!r} does not fit its policy or noise", "noise needs a policy"
+        )
+    if agent != "policy":
+        # The random and the idle agent act alike either way.
+        evaluation = msgspec.structs.replace(evaluation, deterministic=False)
+    parameters = Parameters(
+        environment=environment_key(env),
+        setting=str(setting),
+        agent=agent,
+        noise=noise,
+        seed=seed,
+        evaluation=evaluation,
+    )
+    with_noise = f" with noise {noise}" if noise else ""
+    label = f"record {policy_label or agent}{with_noise} in {env} {setting} seed {seed}"
+    inputs = {} if policy is None else {"policy": policy}
+    return Request(STAGE, parameters, inputs, label)
+
+
+def run(job: Job) -> None:
+    """Roll out; episode k starts from the same state as episode k of an evaluation."""
+    from irlcli.data.demonstrations import write_demonstrations
+    from irlcli.data.outputs import write_json
+    from irlcli.data.tensors import load_policy_file
+    from irlcli.rl.rollout import roll_out
+
+    p: Parameters = job.parameters
+    env, setting = p.environment.name, parse_setting(p.environment.name, p.setting)
+    policy: Policy | str = p.agent
+    if "policy" in job.inputs:
+        policy, _ = load_policy_file(job.inputs["policy"])
+    trajectories = roll_out(
+        env,
+        setting,
+        policy,
+        p.evaluation.episodes,
+        p.seed,
+        evaluate.STAGE.name,
+        p.evaluation.deterministic,
+        p.noise,
+    )
+    job.warn_of_errors(p.setting, trajectories)
+    means = summary_of(p.setting, trajectories)
+    facts = {p.setting: shown(means["mean_return"], means["mean_progress"])}
+    job.console.progress(1, 1, "settings", facts)
+    write_demonstrations(job.output, env, [(setting, trajectories)], {})
+    write_json(job.output / "summary.json", means)
+
+
+STAGE = Stage("record", 1, run)

@@ -1,0 +1,198 @@
+"""``irl assess`` on LunarLander, through the real command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.tensors import load_policy_file
+from irlcli.store import Store
+
+SMOKE = ["--profile", "smoke", "--quiet"]
+LADDER = [f"clone, noise {noise}" for noise in (0.0, 0.1, 0.25, 0.5, 0.75)]
+
+
+@pytest.fixture(scope="module")
+def assessed(smoke_store, tmp_path_factory, run_irl):
+    """A copy of the smoke store with an assessment in the settings trained in, and the document."""
+    path = tmp_path_factory.mktemp("assess") / "runs"
+    shutil.copytree(smoke_store.path, path, symlinks=True)
+    line = ["assess", "airl", "--store", str(path), *SMOKE, "--json", "--name", "assessed"]
+    done = run_irl(line)
+    assert done.code == 0, done.err
+    return path, json.loads(done.out)
+
+
+def policies(document, setting):
+    return [e["policy"] for e in document["assessment"]["bank"] if e["setting"] == setting]
+
+
+def test_the_bank_in_distribution(assessed):
+    _, document = assessed
+    assert [s["setting"] for s in document["assessment"]["settings"]] == [
+        "engine-power=1x",
+        "engine-power=1.25x",
+    ]
+    found = policies(document, "engine-power=1x")
+    experts = ["expert of engine-power=1.25x", "expert of engine-power=1x"]
+    assert found == ["idle", "random", *LADDER, "student", *experts]
+    kinds = {
+        e["policy"]: e["kind"]
+        for e in document["assessment"]["bank"]
+        if e["setting"] == "engine-power=1x"
+    }
+    assert [kinds[name] for name in experts] == ["reused", "expert"]
+
+
+def test_its_numbers_are_those_of_evaluations(assessed, irl):
+    """The same episodes: starts, actions, true and learned returns."""
+    path, document = assessed
+    bank = {(e["policy"], e["setting"]): e for e in document["assessment"]["bank"]}
+    for policy, agent in (("student", ["--policy", "airl"]), ("idle", ["--idle"])):
+        line = ["evaluate", *agent, "--reward", "airl", "--intervention", "engine-power=1.25x"]
+        done = irl(*line, "--store", path, *SMOKE, "--json")
+        (row,) = json.loads(done.out)["returns"]
+        entry = bank[policy, "engine-power=1.25x"]
+        assert entry["true"]["mean"] == pytest.approx(row["mean"])
+        assert entry["learned"]["mean"] == pytest.approx(row["mean_learned_return"])
+
+
+def test_its_files(assessed):
+    path, document = assessed
+    artefact = Store(path).resolve("assessed").artefact
+    names = {o.path for o in artefact.manifest.outputs}
+    assert names == {"assessment.json", "bank.parquet", "scatter.png", "scatter.svg"}
+    rows = pd.read_parquet(artefact.directory / "bank.parquet")
+    means = rows.groupby(["policy", "setting"])[["true_return", "learned_return"]].mean()
+    for e in document["assessment"]["bank"]:
+        mean = means.loc[e["policy"], e["setting"]]
+        assert mean["true_return"] == pytest.approx(e["true"]["mean"])
+        assert mean["learned_return"] == pytest.approx(e["learned"]["mean"])
+
+
+def test_a_second_call_computes_nothing(assessed, irl):
+    path, document = assessed
+    before = Store(path).ids()
+    plan = irl("assess", "airl", "--store", path, *SMOKE, "--dry-run").out.splitlines()
+    assert {line.split()[0] for line in plan} == {"HIT"}
+    again = irl("assess", "airl", "--store", path, *SMOKE, "--json")
+    assert json.loads(again.out)["id"] == document["id"] and Store(path).ids() == before
+
+
+def test_another_reward_of_the_same_demonstrations_shares_the_bank(assessed, irl):
+    """Only its student has to act."""
+    path, _ = assessed
+    made = irl("train-airl", "--demos", "demos", "--method", "erm", "--store", path, *SMOKE)
+    plan = irl("assess", made.out.strip(), "--store", path, *SMOKE, "--dry-run").out
+    missing = [line.split(": ")[0] for line in plan.splitlines() if not line.startswith("HIT")]
+    assert [line.split()[1:3] for line in missing] == [
+        ["record", "student"],
+        ["record", "student"],
+        ["assess", "lunar-lander"],
+    ]
+
+
+def test_a_policy_retrained_on_the_reward_is_judged_where_the_expert_is_known(assessed, irl):
+    path, _ = assessed
+    line = ["assess", "airl", "--ood", "1.5x", "--store", path, *SMOKE]
+    done = irl(*line, "--json")
+    retrained = f"retrained {Store(path).resolve('moved').artefact.id[:8]}"
+    assert retrained in policies(json.loads(done.out), "engine-power=1.5x")
+    assert done.err.startswith("warning: no expert of engine-power=1.5x with this config")
+    (place,) = json.loads(done.out)["assessment"]["settings"]
+    assert place["retrained"] == [] and place["expert_minus_idle"] is None
+    expert = ["--expert", "--env", "lunar-lander", "--intervention", "engine-power=1.5x"]
+    assert irl("evaluate", *expert, "--store", path, *SMOKE).code == 0
+    done = irl(*line, "--json")
+    assert done.err == ""
+    (place,) = json.loads(done.out)["assessment"]["settings"]
+    (split,) = place["retrained"]
+    assert split["policy"] == retrained
+    means = {e["policy"]: e for e in json.loads(done.out)["assessment"]["bank"]}
+    best, earned = means["expert of engine-power=1.5x"], means[retrained]
+    regret = best["true"]["mean"] - earned["true"]["mean"]
+    gap = best["learned"]["mean"] - earned["learned"]["mean"]
+    assert split["true_regret"]["mean"] == pytest.approx(regret)
+    assert split["learned_gap"]["mean"] == pytest.approx(gap)
+    shown = irl(*line)
+    assert split["verdict"] in shown.err and "Spearman" in shown.err
+
+
+def test_the_clone_imitates(assessed):
+    """It tells the demonstrated action better than always naming the most frequent one would."""
+    path, _ = assessed
+    store = Store(path)
+    (made,) = (a for a in store.artefacts() if a.manifest.record.stage == "clone")
+    policy, description = load_policy_file(made.directory / "policy.pt")
+    assert description.agent == "clone"
+    demos = read_demonstrations(store.resolve("demos").artefact.directory)
+    episodes = [t for group in demos.trajectories.values() for t in group]
+    states = np.concatenate([t.observations[:-1] for t in episodes])
+    actions = np.concatenate([t.actions for t in episodes])
+    chosen = policy.act(states, deterministic=True)
+    common = np.bincount(actions).max() / len(actions)
+    assert (chosen == actions).mean() > common
+
+
+def test_a_reward_without_its_store_has_a_ladder_only_with_demos(smoke_store, irl, tmp_path):
+    shutil.copy(smoke_store.path / smoke_store.airl / "reward.pt", tmp_path)
+    store = tmp_path / "runs"
+    line = ["assess", tmp_path / "reward.pt", "--intervention", "engine-power=1x", *SMOKE]
+    alone = irl(*line, "--store", store, "--dry-run")
+    assert "no ladder of noise" in alone.err and "--demos" in alone.err
+    assert "clone" not in alone.out and "record idle" in alone.out
+    demos = smoke_store.path / smoke_store.demos
+    given = irl(*line, "--store", store, "--demos", demos, "--dry-run")
+    assert "no ladder" not in given.err and given.out.count("BLOCKED record clone") == 5
+
+
+def test_an_expert_of_another_store_is_used(smoke_store, irl, tmp_path):
+    shutil.copy(smoke_store.path / smoke_store.airl / "reward.pt", tmp_path)
+    line = ["assess", tmp_path / "reward.pt", "--intervention", "engine-power=1x", *SMOKE]
+    line += ["--store", tmp_path / "runs", "--dry-run"]
+    assert "no expert of engine-power=1x" in irl(*line).err
+    found = irl(*line, "--from", smoke_store.path)
+    assert "no expert" not in found.err
+    assert "FOUND   train-expert lunar-lander engine-power=1x seed 0" in found.out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["demos"], 3, "holds no reward.pt"),
+        (["moved"], 3, "holds no reward.pt"),
+        (["airl/policy.pt"], 2, "not a reward"),
+        (["airl", "--ood", "leg-length=2x"], 2, "'leg-length'"),
+        (["airl", "--ood", "1.5x", "--intervention", "bounce"], 2, "both name settings"),
+        (["airl", "--demos", "airl"], 2, "not a dataset of demonstrations"),
+        (["airl", "--set", "assessment.noise=[2]"], 2, "assessment.noise"),
+        (["nothing"], 3, "'nothing' names no artefact"),
+    ],
+)
+def test_bad_input_is_one_line_and_a_hint(smoke_store, irl, words, code, said):
+    done = irl("assess", *words, "--store", smoke_store.path, *SMOKE)
+    assert done.code == code, done.err
+    assert said in done.err and "hint:" in done.err and "Traceback" not in done.err
+    assert done.out == "" and "RUN" not in done.err
+
+
+def test_tabular_rewards_are_refused(irl, tmp_path):
+    common = ["--store", tmp_path, *SMOKE]
+    irl(
+        "collect-experts",
+        "--env",
+        "gridworld",
+        "--intervention",
+        "path-group",
+        *common,
+        "--name",
+        "d",
+    )
+    irl("train-maxent", "--demos", "d", "--method", "erm", *common, "--name", "maxent")
+    done = irl("assess", "maxent", *common)
+    assert done.code == 2 and "tabular-reward" in done.err and "hint:" in done.err
