@@ -106,6 +106,22 @@ def retrained(config: Config, seed: int = 0) -> Request:
     return transfer.request(reward, ENV, UNSEEN, config.transfer, seed)
 
 
+def by_sac(config: Config, seed: int = 0) -> Request:
+    return retrained(with_field(config, "transfer.algorithm", "sac"), seed)
+
+
+def from_student(config: Config, seed: int = 0) -> Request:
+    learned = airl(config)
+    return transfer.request(
+        From(learned, "reward.pt"),
+        ENV,
+        UNSEEN,
+        config.transfer,
+        seed,
+        start=From(learned, "policy.pt"),
+    )
+
+
 def score(config: Config, seed: int = 0) -> Request:
     policy = From(retrained(config), "policy.pt")
     return evaluate.request(ENV, [UNSEEN], config.evaluation, policy, seed=seed)
@@ -132,6 +148,8 @@ def assessed(config: Config, seed: int = 0) -> Request:
     return assess.request(reward, ENV, bank(ENV, [UNSEEN], config, policies, seed))
 
 
+RETRAINING = ["expert", "demonstrations", "airl", "transfer.algorithm", "transfer.ceiling"]
+RETRAINED = [*RETRAINING, "transfer.total_steps", "transfer.ppo"]
 # Stage to its request, and to the sections and fields that its key depends on.
 REQUESTS = {
     "train-expert": (expert, ["expert"]),
@@ -142,8 +160,16 @@ REQUESTS = {
     "train-maxent": (maxent, ["demonstrations.episodes", "gridworld", "maxent"]),
     "sweep-maxent": (sweep, ["gridworld", "maxent", "figure2"]),
     "figure2": (figure, ["gridworld", "maxent", "figure2"]),
-    "transfer": (retrained, ["expert", "demonstrations", "airl", "transfer"]),
-    "evaluate": (score, ["expert", "demonstrations", "airl", "transfer", "evaluation"]),
+    "transfer": (retrained, RETRAINED),
+    "transfer by SAC": (
+        by_sac,
+        [*RETRAINING[:3], "transfer.ceiling", "transfer.total_steps", "transfer.sac"],
+    ),
+    "transfer from the student": (
+        from_student,
+        [*RETRAINING, "transfer.from_student", "transfer.ppo"],
+    ),
+    "evaluate": (score, [*RETRAINED, "evaluation"]),
     "clone": (
         cloned,
         [
@@ -151,10 +177,10 @@ REQUESTS = {
             *(f"airl.ppo.{name}" for name in clone.Network.__struct_fields__),
         ],
     ),
-    "record": (recorded, ["expert", "demonstrations", "airl", "transfer", "evaluation"]),
+    "record": (recorded, [*RETRAINED, "evaluation"]),
     "assess": (
         assessed,
-        ["expert", "demonstrations", "airl", "transfer", "evaluation", "clone", "assessment"],
+        [*RETRAINED, "evaluation", "clone", "assessment"],
     ),
 }
 # Reports read evaluations that are named one by one; no config field reaches them otherwise.
@@ -166,6 +192,14 @@ UNREAD = {
     # AIRL refuses gSDE, so its frequency is not read.
     "train-airl": ["airl.ppo.sde_sample_freq"],
     "transfer": ["airl.ppo.sde_sample_freq"],
+    "transfer by SAC": ["airl.ppo.sde_sample_freq"],
+    # The student's network, and its own schedule of the learning rate.
+    "transfer from the student": [
+        "airl.ppo.sde_sample_freq",
+        *(f"transfer.ppo.{n}" for n in ("net_arch", "activation", "ortho_init", "log_std_init")),
+        *(f"transfer.ppo.{n}" for n in ("normalise_observations", "use_sde", "sde_sample_freq")),
+        *(f"transfer.ppo.{n}" for n in ("learning_rate", "learning_rate_schedule")),
+    ],
     "evaluate": ["airl.ppo.sde_sample_freq"],
     "record": ["airl.ppo.sde_sample_freq"],
     "assess": ["airl.ppo.sde_sample_freq"],
@@ -186,6 +220,9 @@ CHANGED = {
     "airl.penalty": "other",
     "airl.select": "episodes",
     "transfer.algorithm": "other",
+    "transfer.ceiling": 0.9,
+    "transfer.sac.tau": 0.1,
+    "transfer.sac.ent_coef": 0.1,
     "maxent.penalty": "other",
     "figure2.episodes": (400, 25, 4),
 }
@@ -270,7 +307,7 @@ def test_every_stage_is_covered():
         for m in pkgutil.iter_modules(stages.__path__)
     ]
     names = {module.STAGE.name for module in modules if hasattr(module, "STAGE")}
-    assert names == {name.removesuffix(" tabular") for name in REQUESTS} | REPORTS
+    assert names == {name.partition(" ")[0] for name in REQUESTS} | REPORTS
 
 
 @pytest.mark.parametrize("stage", REQUESTS)
@@ -302,6 +339,7 @@ IRRELEVANT = [
     (expert, {"expert.ppo.batch_size": 1 << 20}, ["expert.ppo.batch_size"]),
     (retrained, {"transfer.ppo.use_sde": False}, ["transfer.ppo.sde_sample_freq"]),
     (retrained, {"transfer.ppo.ent_coef": 0.0}, ["transfer.ppo.ent_coef_schedule"]),
+    (by_sac, {"transfer.sac.net_arch": ()}, ["transfer.sac.activation"]),
     (airl, {"airl.penalty": "none"}, [f"airl.penalty_{name}" for name in PENALTY_FIELDS]),
     (
         airl,
@@ -415,10 +453,30 @@ def test_settings_and_their_order_change_the_key():
     assert len(keys) == 3
 
 
-def test_the_expert_config_of_a_knob_changes_the_keys_of_its_experts_only():
+def test_the_config_of_a_knob_changes_the_keys_of_its_settings_only():
     config = in_use()
-    longer = replace(config.expert, total_steps=2 * config.expert.total_steps)
+    longer = {
+        "expert": replace(config.expert, total_steps=2 * config.expert.total_steps),
+        "transfer": replace(config.transfer, total_steps=2 * config.transfer.total_steps),
+    }
     for knob, differs in (("gravity", True), ("another", False)):
-        interventions = {knob: InterventionConfig(id=(), ood=(), expert=longer)}
-        changed = replace(config, interventions=interventions)
+        listed = InterventionConfig(id=(), ood=(), **longer)
+        changed = replace(config, interventions={knob: listed})
         assert (key(demos(changed)) != key(demos(config))) == differs
+        assert (changed.transfer_of(UNSEEN) != config.transfer_of(UNSEEN)) == differs
+
+
+def test_a_policy_that_begins_as_the_student_has_a_key_of_its_own():
+    config = in_use()
+    assert key(from_student(config)) != key(retrained(config))
+
+
+def test_sac_is_refused_for_discrete_actions_and_for_a_student():
+    sac = with_field(Config(), "transfer.algorithm", "sac").transfer
+    (bounce,) = parse_settings("lunar-lander", "bounce=0.9")
+    learned = From(airl(in_use()), "reward.pt")
+    with pytest.raises(UsageError, match="continuous actions") as discrete:
+        transfer.request(learned, "lunar-lander", bounce, sac)
+    with pytest.raises(UsageError, match="--start student needs PPO") as started:
+        transfer.request(learned, ENV, UNSEEN, sac, start=From(airl(in_use()), "policy.pt"))
+    assert discrete.value.hint == started.value.hint == "--algorithm ppo"

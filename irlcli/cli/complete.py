@@ -41,6 +41,13 @@ def penalties(learner: str) -> list[str]:
     return [name for name, penalty in PENALTIES.items() if learner in penalty.learners]
 
 
+def algorithms(incomplete: str) -> list[str]:
+    """Names of retraining algorithms."""
+    from irlcli.rl import ALGORITHMS
+
+    return list(ALGORITHMS)
+
+
 def profiles(incomplete: str) -> list[str]:
     """Names of profiles."""
     from irlcli.configs import PROFILES

@@ -4,13 +4,15 @@ from typing import Annotated
 
 import typer
 
-from irlcli.cli import arguments
+from irlcli.cli import arguments, complete
 from irlcli.cli.options import Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.errors import UsageError
+from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
 from irlcli.stages import transfer as stage
 from irlcli.stages.train_airl import describe
+
+_STARTS = ("scratch", "student")
 
 
 @stage_command
@@ -20,14 +22,29 @@ def transfer(
     ood: Annotated[
         str, typer.Option(help="Setting: VALUE, KNOB=VALUE, or KNOB for its OOD value.")
     ],
+    algorithm: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Retraining algorithm: {', '.join(complete.algorithms(''))}.",
+            autocompletion=complete.algorithms,
+        ),
+    ] = None,
+    start: Annotated[
+        str,
+        typer.Option(
+            help="scratch: a random policy; student: the one trained while the reward was learned."
+        ),
+    ] = "scratch",
     env: Env = None,
     seed: Seed = 0,
     name: Name = None,
 ) -> None:
     """Train a new policy on a frozen reward in an unseen setting."""
+    if start not in _STARTS:
+        raise UsageError(f"unknown --start {start!r}", suggest(start, _STARTS))
     source, origin = references.tensor_file(session.store, reward, "reward")
     arguments.check_env(reward, origin.env, env)
-    config = session.config(origin.env)
+    config = session.config(origin.env, {"transfer.algorithm": algorithm})
     settings = arguments.named_settings(origin.env, config, ood, "ood", origin)
     if len(settings) != 1:
         names = ", ".join(str(setting) for setting in settings)
@@ -35,5 +52,13 @@ def transfer(
             f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one at a time"
         )
     label = f"{describe(origin.airl)} seed {origin.seed}"
-    request = stage.request(source, origin.env, settings[0], config.transfer, seed, label)
+    request = stage.request(
+        source,
+        origin.env,
+        settings[0],
+        config.transfer_of(settings[0]),
+        seed,
+        label,
+        references.student_beside(source) if start == "student" else None,
+    )
     session.deliver([request], name)

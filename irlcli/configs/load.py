@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Struct
 
 from irlcli.configs.relevance import check_registered
-from irlcli.configs.schema import Config, ExpertConfig, InterventionConfig
+from irlcli.configs.schema import Config, ExpertConfig, InterventionConfig, TransferConfig
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
 from irlcli.interventions import knob_of, overlap, parse_settings
@@ -88,20 +88,31 @@ def _stack(env: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Config:
         except UsageError as error:
             raise UsageError(f"{source}: {error.message}", error.hint) from None
     interventions = {
-        knob: msgspec.structs.replace(intervention, expert=_expert_of_knob(knob, layers))
+        knob: msgspec.structs.replace(
+            intervention,
+            **{
+                section: _of_knob(knob, section, kind, layers)
+                for section, kind in (("expert", ExpertConfig), ("transfer", TransferConfig))
+                if getattr(intervention, section) is not None
+            },
+        )
         for knob, intervention in config.interventions.items()
-        if intervention.expert is not None
     }
-    return msgspec.structs.replace(config, interventions=config.interventions | interventions)
+    return msgspec.structs.replace(config, interventions=interventions)
 
 
-def _expert_of_knob(knob: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> ExpertConfig:
-    """In each layer the knob's own table wins over ``[expert]``; a later layer wins over both."""
+def _of_knob(
+    knob: str, section: str, kind: Any, layers: Sequence[tuple[str, Mapping[str, Any]]]
+) -> Any:
+    """A knob's own config of ``section``, of type ``kind``.
+
+    In each layer the knob's own table wins over ``[section]``; a later layer wins over both.
+    """
     tree: dict[str, Any] = {}
     for _, values in layers:
-        tree = _merge(tree, values.get("expert", {}))
-        tree = _merge(tree, values.get("interventions", {}).get(knob, {}).get("expert", {}))
-    return msgspec.convert(tree, ExpertConfig)
+        tree = _merge(tree, values.get(section, {}))
+        tree = _merge(tree, values.get("interventions", {}).get(knob, {}).get(section, {}))
+    return msgspec.convert(tree, kind)
 
 
 def settings_directory() -> Path:

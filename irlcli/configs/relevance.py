@@ -17,6 +17,12 @@ from irlcli.rl import ALGORITHMS
 _PPO = PPOConfig()
 _AIRL = AIRLConfig()
 _MAXENT = MaxEntConfig()
+_TRANSFER = TransferConfig()
+# What a policy that begins as the student takes from it.
+_OF_THE_STUDENT = (
+    *("net_arch", "activation", "ortho_init", "normalise_observations"),
+    *("log_std_init", "use_sde", "sde_sample_freq"),
+)
 
 
 def check_registered(config: Config) -> None:
@@ -102,14 +108,44 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     return replace(airl, ppo=relevant_ppo(airl.ppo, discrete_actions, "airl.ppo"))
 
 
-def relevant_transfer(transfer: TransferConfig, discrete_actions: bool) -> TransferConfig:
-    """``transfer`` without what its algorithm leaves unused.
+def relevant_transfer(
+    transfer: TransferConfig, discrete_actions: bool, from_student: bool = False
+) -> TransferConfig:
+    """``transfer`` without what its algorithm and its start leave unused.
+
+    A policy that begins as the student has its network and its actions' deviation, and takes the
+    budget and the learning rate of ``transfer.from_student``.
 
     Raises:
-        UsageError: an unknown algorithm, or an option that does not fit the actions.
+        UsageError: an unknown algorithm, or one or an option that does not fit the actions or the
+            start.
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
-    return replace(transfer, ppo=relevant_ppo(transfer.ppo, discrete_actions, "transfer.ppo"))
+    if transfer.algorithm == "sac":
+        if discrete_actions:
+            raise UsageError("SAC needs continuous actions", "--algorithm ppo")
+        if from_student:
+            raise UsageError(
+                "--start student needs PPO: a student's network is no actor of SAC",
+                "--algorithm ppo",
+            )
+        sac = transfer.sac
+        if not sac.net_arch:
+            sac = replace(sac, activation=_TRANSFER.sac.activation)
+        return replace(transfer, ppo=_PPO, sac=sac, from_student=_TRANSFER.from_student)
+    if from_student:
+        transfer = replace(
+            transfer,
+            total_steps=transfer.from_student.total_steps,
+            ppo=replace(
+                transfer.ppo,
+                learning_rate=transfer.from_student.learning_rate,
+                learning_rate_schedule="linear",
+                **{name: getattr(_PPO, name) for name in _OF_THE_STUDENT},
+            ),
+        )
+    ppo = relevant_ppo(transfer.ppo, discrete_actions, "transfer.ppo")
+    return replace(transfer, ppo=ppo, sac=_TRANSFER.sac, from_student=_TRANSFER.from_student)
 
 
 def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:

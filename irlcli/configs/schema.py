@@ -77,19 +77,82 @@ class ExpertConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     ppo: PPOConfig = PPOConfig()
 
 
+class SACConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SAC (Haarnoja et al. 2018), for continuous actions only.
+
+    Attributes:
+        n_envs: worlds stepped together.
+        n_steps: steps of each world in a round. Every round starts new episodes.
+        train_freq: steps of each world between two updates, of ``gradient_steps`` minibatches each.
+        learning_starts: steps, in sum over the worlds, of uniformly random actions.
+        buffer_size: transitions kept for replay.
+        tau: weight of the new parameters in the target network.
+        ent_coef: temperature of the entropy bonus; None: learned.
+        normalise_rewards: by the running deviation of their discounted sums, when sampled.
+    """
+
+    n_envs: Annotated[int, Meta(ge=1, le=1024)] = 16
+    n_steps: Annotated[int, Meta(ge=1, le=65536)] = 1024
+    train_freq: Count = 4
+    gradient_steps: Count = 16
+    learning_starts: NonNegativeCount = 10_000
+    # Bounded, so that no file can ask for more than memory holds.
+    buffer_size: Annotated[int, Meta(ge=1, le=4_000_000)] = 300_000
+    batch_size: Annotated[int, Meta(ge=2, le=65536)] = 256
+    learning_rate: Positive = 3e-4
+    gamma: Discount = 0.99
+    tau: Annotated[float, Meta(gt=0, le=1)] = 0.005
+    ent_coef: NonNegative | None = None
+    net_arch: Widths = (256, 256)
+    activation: Activation = "relu"
+    normalise_observations: bool = True
+    normalise_rewards: bool = True
+
+
+class FromStudentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Retraining that begins as the reward's student: few steps, a rate that falls to zero."""
+
+    total_steps: Count = 250_000
+    learning_rate: Positive = 1e-4
+
+
+class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A new policy on a frozen reward (paper Sec. 5.3).
+
+    Attributes:
+        algorithm: a key of :data:`irlcli.rl.ALGORITHMS`.
+        ceiling: every step's reward is at most this quantile of g on the demonstrations; None: g
+            has no bound.
+        from_student: replaces the budget and the learning rate with ``--start student``.
+    """
+
+    algorithm: str = "ppo"
+    total_steps: Count = 1_000_000
+    ceiling: Fraction | None = None
+    ppo: PPOConfig = PPOConfig()
+    sac: SACConfig = SACConfig()
+    from_student: FromStudentConfig = FromStudentConfig()
+
+    @property
+    def trained_by(self) -> PPOConfig | SACConfig:
+        """The config of ``algorithm``; all but SAC take PPO's."""
+        return self.sac if self.algorithm == "sac" else self.ppo
+
+
 class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Paper Table 2: the values trained on (``id``) and the held-out ones (``ood``).
 
     Attributes:
         episodes: demonstrations of each value trained on, where they differ.
-        expert: in a file, what this knob's experts need different from ``[expert]``; once
-            loaded, their whole config.
+        expert, transfer: in a file, what this knob's experts and retrained policies need
+            different from ``[expert]`` and ``[transfer]``; once loaded, their whole config.
     """
 
     id: tuple[str, ...]
     ood: tuple[str, ...]
     episodes: tuple[Count, ...] = ()
     expert: ExpertConfig | None = None
+    transfer: TransferConfig | None = None
 
 
 class DemonstrationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -155,17 +218,6 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     select: str = "last"
     select_every: Count = 10
     select_episodes: Count = 10
-    ppo: PPOConfig = PPOConfig()
-
-
-class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A new policy on a frozen reward (paper Sec. 5.3).
-
-    ``algorithm`` is a key of :data:`irlcli.rl.ALGORITHMS`.
-    """
-
-    algorithm: str = "ppo"
-    total_steps: Count = 1_000_000
     ppo: PPOConfig = PPOConfig()
 
 
@@ -259,3 +311,10 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if intervention is None or intervention.expert is None:
             return self.expert
         return intervention.expert
+
+    def transfer_of(self, setting: Setting) -> TransferConfig:
+        """The config of a policy retrained in ``setting``, with what its knob needs different."""
+        intervention = self.interventions.get(setting.knob or "")
+        if intervention is None or intervention.transfer is None:
+            return self.transfer
+        return intervention.transfer

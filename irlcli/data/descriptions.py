@@ -29,6 +29,9 @@ MethodName = Annotated[str, Meta(max_length=100)]
 Agent = Literal["expert", "student", "transfer", "clone", "random", "idle"]
 
 
+Quantiles = Annotated[tuple[Finite, ...], Meta(min_length=101, max_length=101)]
+
+
 class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Arguments of :class:`irlcli.learners.reward_model.RewardModel`."""
 
@@ -51,8 +54,9 @@ class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """``reward.json``, and the description inside ``reward.pt``.
 
-    ``scale`` is the standard deviation of g on the training data. ``selected`` is None if the
-    last round is deployed.
+    ``scale`` is the standard deviation of g on the training data. ``quantiles`` are the 0, 1, ...
+    100 % quantiles of g on the demonstrations; None in files of version 0.1. ``selected`` is None
+    if the last round is deployed.
     """
 
     env: str
@@ -62,6 +66,7 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     airl: AIRLConfig
     network: RewardNetwork
     scale: Positive
+    quantiles: Quantiles | None = None
     selected: Selected | None = None
 
 
@@ -76,20 +81,27 @@ class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     maxent: MaxEntConfig
 
 
-class PolicyNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The actor-critic network that :func:`irlcli.rl.policy.load_policy` rebuilds."""
+class PolicyNetwork(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
+):
+    """The network that :func:`irlcli.rl.policy.load_policy` rebuilds.
+
+    PPO's actor-critic, or, if ``squashed``, SAC's actor.
+    """
 
     net_arch: Widths
     activation: Activation
     normalise_observations: bool
     use_sde: bool
+    squashed: bool = False
 
 
 class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """``policy.json``, and the description inside ``policy.pt``.
 
     ``settings`` are those the policy was trained in. A retrained policy also names the reward it
-    was trained on (``method``, ``reward_seed``, ``reward_settings``).
+    was trained on (``method``, ``reward_seed``, ``reward_settings``), and whether it began as that
+    reward's student.
     """
 
     agent: Agent
@@ -100,6 +112,7 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     method: MethodName | None = None
     reward_seed: int | None = None
     reward_settings: tuple[str, ...] | None = None
+    from_student: bool = False
 
 
 class EnvironmentName(Struct, frozen=True, kw_only=True):
@@ -129,6 +142,7 @@ class Subject(Struct, frozen=True, kw_only=True):
     method: MethodName | None = None
     seed: int | None = None
     reward_seed: int | None = None
+    from_student: bool = False
 
 
 class LearnedReward(Struct, frozen=True, kw_only=True):

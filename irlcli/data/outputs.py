@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pyarrow as pa
 
-from irlcli.configs import PPOConfig
+from irlcli.configs import PPOConfig, SACConfig
 from irlcli.data import descriptions, tensors
 from irlcli.data.parquet import write_table
 from irlcli.rl.policy import Policy, describe
@@ -35,12 +35,14 @@ def write_metrics(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     write_table(pa.Table.from_pylist(list(rows)), directory / "metrics.parquet")
 
 
-def write_policy(directory: Path, policy: Policy, ppo: PPOConfig, **origin: Any) -> None:
+def write_policy(
+    directory: Path, policy: Policy, config: PPOConfig | SACConfig, **origin: Any
+) -> None:
     """Write ``policy.pt`` and its description ``policy.json``, which is readable without torch.
 
     ``origin`` holds the fields of :class:`descriptions.Policy` other than ``network``.
     """
-    description = descriptions.Policy(network=describe(ppo), **origin)
+    description = descriptions.Policy(network=describe(config), **origin)
     tensors.save(directory / "policy.pt", "policy", description, policy.state_dict())
     write_json(directory / "policy.json", msgspec.to_builtins(description))
 
@@ -48,9 +50,11 @@ def write_policy(directory: Path, policy: Policy, ppo: PPOConfig, **origin: Any)
 def write_reward(directory: Path, learner: Any, **origin: Any) -> None:
     """Write ``reward.pt`` and its description ``reward.json``, which is readable without torch.
 
-    ``learner`` has ``network``, ``scale`` and ``model``; ``origin`` holds the other fields of
-    :class:`descriptions.Reward`.
+    ``learner`` has ``network``, ``scale``, ``quantiles`` and ``model``; ``origin`` holds the other
+    fields of :class:`descriptions.Reward`.
     """
-    description = descriptions.Reward(network=learner.network, scale=learner.scale, **origin)
+    description = descriptions.Reward(
+        network=learner.network, scale=learner.scale, quantiles=learner.quantiles, **origin
+    )
     tensors.save(directory / "reward.pt", "reward", description, learner.model.state_dict())
     write_json(directory / "reward.json", msgspec.to_builtins(description))

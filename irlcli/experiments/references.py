@@ -64,6 +64,23 @@ def tensor_file(
     return source, descriptions.parse(read_json(path), descriptions.Policy, path)
 
 
+def student_beside(reward: Source) -> Source:
+    """The ``policy.pt`` of the student that was trained while ``reward`` was learned.
+
+    Raises:
+        NotFound: there is none beside the reward's file.
+    """
+    if reward.artefact is not None:
+        student = reward.artefact.directory / _only(reward.artefact, "policy.pt")
+        return source_of(Resolved(reward.artefact, student))
+    student = reward.path.parent / "policy.pt"
+    if not student.is_file():
+        raise NotFound(
+            f"there is no student beside {reward.path}", f"--start student needs {student}"
+        )
+    return source_of(Resolved(None, student))
+
+
 def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
     """The dataset that ``ref`` names, its environment and its settings.
 

@@ -221,7 +221,12 @@ def _run(
         yield Task(f"{name}.id-returns", "returns", request, cell)
     if "transfer" in measures:
         moved = transfer.request(
-            From(learned, "reward.pt"), env, unseen[0], requests.config.transfer, seed, learner
+            From(learned, "reward.pt"),
+            env,
+            unseen[0],
+            requests.config.transfer_of(unseen[0]),
+            seed,
+            learner,
         )
         yield Task(f"{name}.transfer", "transfers", moved)
         cell = requests.cell(method_name, "transfer", seed)

@@ -418,6 +418,17 @@ class AIRL:
             self.config.penalty_scaling, self.config.penalty_estimate == "unbiased"
         )
 
+    @property
+    def quantiles(self) -> tuple[float, ...]:
+        """Of g on the demonstrations, see :func:`reward_quantiles`."""
+        return reward_quantiles(
+            self.model,
+            [
+                make_pool(self.model, data, torch.zeros(len(data)), self.config.fixed_horizon)
+                for data in map(join, self._demonstrations)
+            ],
+        )
+
     # Checkpoints and snapshots
 
     def state_dict(self) -> dict[str, Any]:
@@ -459,6 +470,23 @@ def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
     with torch.no_grad():
         g = torch.cat([model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools])
     return max(float(g.double().std()), 1e-6)
+
+
+def reward_quantiles(model: RewardModel, demonstrations: Sequence[Pool]) -> tuple[float, ...]:
+    """The 0, 1, ... 100 % quantiles of g over the settings' pools of ``demonstrations``.
+
+    Each row counts as often as drawn; all settings weigh the same.
+    """
+    with torch.no_grad():
+        g = [model.reward(pool.observations, pool.actions)[pool.draw] for pool in demonstrations]
+    weights = np.concatenate([np.full(len(values), 1.0 / len(values)) for values in g])
+    found = np.quantile(
+        torch.cat(g).double().numpy(),
+        np.linspace(0.0, 1.0, 101),
+        weights=weights,
+        method="inverted_cdf",
+    )
+    return tuple(float(value) for value in found)
 
 
 def episode_reward(model: RewardModel, data: Transitions, absorbing: bool) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,27 @@ import torch
 from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
 from irlcli.learners.actions import ActionView, Policy
-from irlcli.learners.airl import episode_reward, policy_reward
+from irlcli.learners.airl import episode_reward
 from irlcli.learners.reward_model import RewardModel
-from irlcli.trajectories import ActionSpace, Rollout, Trajectory, transitions
+from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
+
+
+def bounded_pay(
+    model: RewardModel, data: Transitions, ceiling: float, absorbing: bool, gamma: float
+) -> torch.Tensor:
+    """min(g, ``ceiling``) of each transition [B] float32, without gradient.
+
+    With ``absorbing``, a terminated transition also earns the discounted sum of its absorbing
+    state's rewards, gamma / (1 - gamma) times the bounded reward there.
+    """
+    with torch.no_grad():
+        actions = model.encode(torch.as_tensor(data.actions))
+        pay = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
+        terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
+        if absorbing and bool(terminated.any()):
+            g, _ = model.absorbing_reward(torch.as_tensor(data.next_observations))
+            pay = pay + terminated * gamma / (1.0 - gamma) * g.clamp(max=ceiling)
+        return pay
 
 
 class FrozenReward:
@@ -26,9 +45,12 @@ class FrozenReward:
         where: environment and setting, for messages.
         observation_size: D of that setting.
         actions: its actions.
+        ceiling: a step's reward is at most this quantile of g on the demonstrations; None: g has
+            no bound. Returns of episodes are never bounded: they measure the reward as learned.
 
     Raises:
-        UsageError: the reward takes other observations or actions.
+        UsageError: the reward takes other observations or actions, or has no quantiles for a
+            ceiling.
     """
 
     def __init__(
@@ -40,6 +62,7 @@ class FrozenReward:
         where: str,
         observation_size: int,
         actions: ActionSpace,
+        ceiling: float | None = None,
     ):
         network = origin.network
         if observation_size != network.observation_size:
@@ -54,6 +77,15 @@ class FrozenReward:
                 f"the reward takes {_actions(network)}, but {where} has {_actions(actions)}",
                 "a reward belongs to the environment it was learned in",
             )
+        self._ceiling = math.inf
+        if ceiling is not None:
+            if origin.quantiles is None:
+                raise UsageError(
+                    f"transfer.ceiling = {ceiling:g} needs the quantiles of g on the "
+                    "demonstrations, which this reward's file does not hold",
+                    "learn the reward again with irl train-airl, or omit transfer.ceiling",
+                )
+            self._ceiling = float(np.interp(100.0 * ceiling, range(101), origin.quantiles))
         self._model = model
         self._scale = origin.scale
         self._horizon = horizon
@@ -64,9 +96,8 @@ class FrozenReward:
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The reward [T, N] of every step; what ``policy`` does elsewhere does not matter."""
         data = self._view.of(rollout.transitions(slice(None), self._horizon))
-        log_probs = torch.as_tensor(rollout.log_probs.ravel())
-        g = policy_reward(self._model, data, log_probs, "g", self._absorbing, self._gamma)
-        return (g / self._scale).numpy().reshape(rollout.terminated.shape)
+        pay = bounded_pay(self._model, data, self._ceiling, self._absorbing, self._gamma)
+        return (pay / self._scale).numpy().reshape(rollout.terminated.shape)
 
     def of_episode(self, trajectory: Trajectory) -> float:
         """The undiscounted learned return of a whole episode.

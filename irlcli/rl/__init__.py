@@ -6,10 +6,11 @@ Importing it loads neither torch nor stable-baselines3.
 from importlib import import_module
 from typing import Any
 
-# Name to module and class, one line each. A class takes (worlds, ppo, total_steps, seed, purpose)
-# and has what :class:`irlcli.rl.loop.Training` calls.
+# Name to module and class, one line each. A class takes (worlds, config, total_steps, seed, purpose)
+# and is a :class:`irlcli.rl.loop.Trainer`. All but SAC are configured by ``transfer.ppo``.
 ALGORITHMS = {
     "ppo": "irlcli.rl.ppo:PPOTrainer",
+    "sac": "irlcli.rl.sac:SACTrainer",
 }
 
 

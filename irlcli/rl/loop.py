@@ -11,17 +11,46 @@ from typing import Any, Protocol
 import numpy as np
 
 from irlcli.rl.policy import Policy
-from irlcli.rl.ppo import PPOTrainer, RewardSource
+from irlcli.rl.ppo import RewardSource
 from irlcli.trajectories import Rollout, world_settings
 
 Row = dict[str, Any]
 State = dict[str, Any]
 
 
+class Trainer(Protocol):
+    """A policy and the algorithm that trains it, one seeded round at a time."""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps taken so far."""
+
+    @property
+    def steps_per_round(self) -> int:
+        """Environment steps of one round."""
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of the whole run."""
+
+    @property
+    def policy(self) -> Policy:
+        """The current policy; it keeps learning with the trainer."""
+
+    def train_round(self, index: int, source: RewardSource) -> list[Rollout]:
+        """Run round ``index`` on the rewards of ``source``, from fresh episodes."""
+
+    def state_dict(self) -> State:
+        """What a resumed run needs from the end of the last round."""
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from ``state_dict()``."""
+
+
 class Learner(Protocol):
     """What learns from the policy's rollouts while the policy learns."""
 
-    def begin(self, trainer: PPOTrainer) -> None:
+    def begin(self, trainer: Trainer) -> None:
         """Called once, before the first round."""
 
     def update(
@@ -58,7 +87,7 @@ class NoLearner:
     def __init__(self, settings: int):
         self._settings = settings
 
-    def begin(self, trainer: PPOTrainer) -> None:
+    def begin(self, trainer: Trainer) -> None:
         """Change nothing."""
 
     def update(
@@ -106,7 +135,7 @@ class Training:
 
     def __init__(
         self,
-        trainer: PPOTrainer,
+        trainer: Trainer,
         source: RewardSource,
         learner: Learner,
         selector: Selector,

@@ -1,15 +1,19 @@
-"""Policies: SB3's actor-critic network, and how one is described, saved and rebuilt."""
+"""Policies: SB3's networks, and how one is described, saved and rebuilt."""
 
 from __future__ import annotations
 
 import gymnasium
 import numpy as np
 import torch
-from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.distributions import (
+    Distribution,
+    SquashedDiagGaussianDistribution,
+)
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.sac.policies import Actor
 
-from irlcli.configs import PPOConfig
+from irlcli.configs import PPOConfig, SACConfig
 from irlcli.data.descriptions import PolicyNetwork
 from irlcli.envs.registration import make
 from irlcli.errors import UsageError
@@ -80,19 +84,53 @@ class Policy:
         self.network.load_state_dict(state)
 
 
+class SquashedPolicy(Policy):
+    """SAC's actor: a Gaussian squashed by tanh into the action bounds. Only PPO's are cloned."""
+
+    network: Actor  # type: ignore[assignment]
+
+    def __init__(self, network: Actor):
+        self.network = network
+
+    def act(self, observations: np.ndarray, deterministic: bool = False) -> np.ndarray:
+        """Actions [N, A] within the bounds for observations [N, D]; samples as :class:`Policy`."""
+        with torch.no_grad():
+            actions = self.network(torch.as_tensor(observations), deterministic)
+            return self.network.unscale_action(actions.numpy())
+
+    def log_prob(
+        self, observations: torch.Tensor, actions: torch.Tensor, gradient: bool = False
+    ) -> torch.Tensor:
+        """log pi(a|s) [B] for observations [B, D] and actions [B, A]."""
+        with torch.set_grad_enabled(gradient):
+            mean, log_std, _ = self.network.get_action_dist_params(observations)
+            squashed = self.network.action_dist
+            assert isinstance(squashed, SquashedDiagGaussianDistribution)
+            found = squashed.proba_distribution(mean, log_std)
+            low, high = (torch.as_tensor(b) for b in self._bounds)
+            scaled = 2.0 * (actions - low) / (high - low) - 1.0
+            return found.log_prob(scaled) - torch.log((high - low) / 2.0).sum()
+
+    @property
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.network.action_space.low, self.network.action_space.high
+
+
 def _torch_distribution(found: Distribution) -> torch.distributions.Distribution:
     """Torch's distribution inside SB3's: its samples need no gSDE noise matrix."""
     assert isinstance(found.distribution, torch.distributions.Distribution)
     return found.distribution
 
 
-def describe(ppo: PPOConfig) -> PolicyNetwork:
+def describe(config: PPOConfig | SACConfig) -> PolicyNetwork:
     """What :func:`load_policy` needs besides the tensors and a setting."""
+    squashed = isinstance(config, SACConfig)
     return PolicyNetwork(
-        net_arch=ppo.net_arch,
-        activation=ppo.activation,
-        normalise_observations=ppo.normalise_observations,
-        use_sde=ppo.use_sde,
+        net_arch=config.net_arch,
+        activation=config.activation,
+        normalise_observations=config.normalise_observations,
+        use_sde=isinstance(config, PPOConfig) and config.use_sde,
+        squashed=squashed,
     )
 
 
@@ -108,21 +146,50 @@ def load_policy(
     """
     torch.set_num_threads(1)
     world = make(env, setting)
-    network = ActorCriticPolicy(
-        world.observation_space,
-        world.action_space,
-        lambda _: 0.0,
-        net_arch=list(description.net_arch),
-        activation_fn=ACTIVATIONS[description.activation],
-        # The tensors below replace the first weights, whatever they are.
-        ortho_init=False,
-        features_extractor_class=extractor(description.normalise_observations),
-        use_sde=description.use_sde,
-    )
+    spaces = world.observation_space, world.action_space
     world.close()
-    network.load_state_dict(state)
-    network.set_training_mode(False)
-    return Policy(network)
+    policy = (
+        _squashed(*spaces, description) if description.squashed else _plain(*spaces, description)
+    )
+    policy.load_state_dict(state)
+    policy.network.set_training_mode(False)
+    return policy
+
+
+def _plain(
+    observations: gymnasium.Space, actions: gymnasium.Space, description: PolicyNetwork
+) -> Policy:
+    return Policy(
+        ActorCriticPolicy(
+            observations,
+            actions,
+            lambda _: 0.0,
+            net_arch=list(description.net_arch),
+            activation_fn=ACTIVATIONS[description.activation],
+            # The file's tensors replace the first weights, whatever they are.
+            ortho_init=False,
+            features_extractor_class=extractor(description.normalise_observations),
+            use_sde=description.use_sde,
+        )
+    )
+
+
+def _squashed(
+    observations: gymnasium.Space, actions: gymnasium.Space, description: PolicyNetwork
+) -> SquashedPolicy:
+    if not isinstance(actions, gymnasium.spaces.Box):
+        raise ValueError("a squashed policy needs continuous actions")
+    features = extractor(description.normalise_observations)(observations)
+    return SquashedPolicy(
+        Actor(
+            observations,
+            actions,
+            list(description.net_arch),
+            features,
+            features.features_dim,
+            ACTIVATIONS[description.activation],
+        )
+    )
 
 
 def require_observations(policy: Policy, space: gymnasium.Space, where: str) -> None:

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import LinearSchedule
 
 from irlcli.configs import PPOConfig
 from irlcli.errors import StageFailed
-from irlcli.networks import ACTIVATIONS, CLIP
+from irlcli.networks import ACTIVATIONS
+from irlcli.rl.pay import RunningDeviation
 from irlcli.rl.policy import NormalisingExtractor, Policy, extractor
 from irlcli.rl.worlds import RecordingVecEnv, Worlds
 from irlcli.seeds import derive
@@ -77,8 +77,7 @@ class PPOTrainer:
         self._purpose = purpose
         self._keep_moments = keep_moments
         self._venv = RecordingVecEnv(worlds)
-        self._reward_moments = _moments(0.0, 1.0, 0.0)
-        self._discounted = np.zeros(len(worlds))
+        self._deviation = RunningDeviation(ppo.gamma, len(worlds))
         with warnings.catch_warnings():
             # A buffer that the batch size does not divide gives one short batch, as intended.
             warnings.filterwarnings("ignore", message=".*mini-batch size.*")
@@ -143,7 +142,7 @@ class PPOTrainer:
         self._venv.seeds = world_seeds
         self.model._last_obs = self._venv.reset()
         self.model._last_episode_starts = np.ones(self._venv.num_envs, dtype=bool)
-        self._discounted[:] = 0.0
+        self._deviation.begin()
         rollouts = []
         for _ in range(self.ppo.rollouts_per_round):
             rollout = self._collect()
@@ -182,35 +181,12 @@ class PPOTrainer:
         model, buffer = self.model, self.model.rollout_buffer
         self._venv.start_recording()
         model.collect_rollouts(self._venv, self._callback, buffer, model.n_steps)
-        shape = (model.n_steps, self._venv.num_envs)
         # SB3 flattens the buffer's arrays in place when it trains: these are copies.
-        observations = buffer.observations.copy()
-        next_observations = np.concatenate([observations[1:], self._last_observations[None]])
-        terminated, truncated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-        lengths, returns = np.zeros(shape, dtype=np.int64), np.zeros(shape)
-        progress = np.full(shape, np.nan)
-        for t, end in self._venv.ended:
-            next_observations[t, end.world] = end.final_observation
-            terminated[t, end.world] = end.terminated
-            truncated[t, end.world] = not end.terminated
-            lengths[t, end.world] = end.length
-            returns[t, end.world] = end.episode_return
-            progress[t, end.world] = end.progress
         actions = buffer.actions.copy()
         if isinstance(model.action_space, gymnasium.spaces.Discrete):
             actions = actions[..., 0].astype(np.int64)
-        return Rollout(
-            observations=observations,
-            actions=actions,
-            next_observations=next_observations,
-            log_probs=buffer.log_probs.copy(),
-            true_rewards=np.stack(self._venv.rewards),
-            terminated=terminated,
-            truncated=truncated,
-            lengths=lengths,
-            returns=returns,
-            progress=progress,
-            errors=tuple((end.world, end.error) for _, end in self._venv.ended if end.error),
+        return self._venv.rollout(
+            buffer.observations.copy(), actions, buffer.log_probs.copy(), self._last_observations
         )
 
     @property
@@ -224,7 +200,8 @@ class PPOTrainer:
             # The buffer holds them since the rollout was collected.
             return
         if self.ppo.normalise_rewards:
-            rewards = self._normalised(rewards, rollout)
+            self._deviation.update(rewards, rollout.terminated | rollout.truncated)
+            rewards = self._deviation.normalise(rewards)
         model, buffer = self.model, self.model.rollout_buffer
         rewards = np.array(rewards, dtype=np.float32)
         with torch.no_grad():
@@ -237,24 +214,13 @@ class PPOTrainer:
         starts = np.asarray(model._last_episode_starts)
         buffer.compute_returns_and_advantage(last_values, starts)
 
-    def _normalised(self, rewards: np.ndarray, rollout: Rollout) -> np.ndarray:
-        """``rewards`` [T, N] over the deviation of their discounted sums, this rollout included."""
-        ended = rollout.terminated | rollout.truncated
-        sums = np.empty(rewards.shape)
-        for t in range(len(rewards)):
-            sums[t] = self._discounted = self.ppo.gamma * self._discounted + rewards[t]
-            self._discounted = np.where(ended[t], 0.0, self._discounted)
-        self._reward_moments.update(sums.ravel())
-        return np.clip(rewards / np.sqrt(self._reward_moments.var + 1e-8), -CLIP, CLIP)
-
     def state_dict(self) -> dict[str, Any]:
         """What a resumed run needs from the end of the last round (tensors, numbers)."""
-        moments = self._reward_moments
         return {
             "policy": self.model.policy.state_dict(),
             "optimizer": self.model.policy.optimizer.state_dict(),
             "steps": self.model.num_timesteps,
-            "reward_moments": [float(moments.mean), float(moments.var), float(moments.count)],
+            "reward_moments": self._deviation.state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -262,7 +228,7 @@ class PPOTrainer:
         self.model.policy.load_state_dict(state["policy"])
         self.model.policy.optimizer.load_state_dict(state["optimizer"])
         self.model.num_timesteps = int(state["steps"])
-        self._reward_moments = _moments(*state["reward_moments"])
+        self._deviation.load_state(state["reward_moments"])
 
 
 def rounds(ppo: PPOConfig, total_steps: int) -> int:
@@ -272,12 +238,6 @@ def rounds(ppo: PPOConfig, total_steps: int) -> int:
 
 def _steps_per_round(ppo: PPOConfig) -> int:
     return ppo.rollouts_per_round * ppo.n_steps * ppo.n_envs
-
-
-def _moments(mean: Any, variance: Any, count: float) -> RunningMeanStd:
-    moments = RunningMeanStd()
-    moments.mean, moments.var, moments.count = np.asarray(mean), np.asarray(variance), count
-    return moments
 
 
 def _policy_kwargs(ppo: PPOConfig) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from irlcli.envs.registry import environment
 from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.envs.workers import WorkerWorlds
 from irlcli.interventions import Setting
-from irlcli.trajectories import ActionSpace, world_settings
+from irlcli.trajectories import ActionSpace, Rollout, world_settings
 
 Worlds = VectorWorlds | WorkerWorlds
 
@@ -88,6 +88,47 @@ class RecordingVecEnv(VecEnv):
         self.rewards.append(rewards)
         # SB3 adds the bootstrapped value of truncated steps to the array that it receives.
         return observations, rewards.astype(np.float32), dones, infos
+
+    def rollout(
+        self,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        log_probs: np.ndarray,
+        last_observations: np.ndarray,
+    ) -> Rollout:
+        """The T steps recorded since :meth:`start_recording`.
+
+        Args:
+            observations: [T, N, D], in which the policy acted.
+            actions: [T, N] or [T, N, A], its samples.
+            log_probs: [T, N].
+            last_observations: [N, D], in which the next step begins.
+        """
+        shape = observations.shape[:2]
+        next_observations = np.concatenate([observations[1:], last_observations[None]])
+        terminated, truncated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+        lengths, returns = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+        progress = np.full(shape, np.nan)
+        for t, end in self.ended:
+            next_observations[t, end.world] = end.final_observation
+            terminated[t, end.world] = end.terminated
+            truncated[t, end.world] = not end.terminated
+            lengths[t, end.world] = end.length
+            returns[t, end.world] = end.episode_return
+            progress[t, end.world] = end.progress
+        return Rollout(
+            observations=observations,
+            actions=actions,
+            next_observations=next_observations,
+            log_probs=log_probs,
+            true_rewards=np.stack(self.rewards),
+            terminated=terminated,
+            truncated=truncated,
+            lengths=lengths,
+            returns=returns,
+            progress=progress,
+            errors=tuple((end.world, end.error) for _, end in self.ended if end.error),
+        )
 
     def close(self) -> None:
         self.worlds.close()

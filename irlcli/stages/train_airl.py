@@ -208,4 +208,4 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("train-airl", 3, run)
+STAGE = Stage("train-airl", 4, run)

@@ -1,12 +1,14 @@
-"""A retrained policy: from random initialisation, on a frozen reward, in one setting (Sec. 5.3)."""
+"""A retrained policy: on a frozen reward, in one setting, at first random (Sec. 5.3) or the student."""
 
 from contextlib import closing
 
 import msgspec
+from msgspec.structs import replace
 
 from irlcli.configs import TransferConfig
 from irlcli.configs.relevance import relevant_transfer
 from irlcli.envs.registry import environment
+from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.stages.base import (
     EnvironmentKey,
@@ -36,60 +38,86 @@ def request(
     transfer: TransferConfig,
     seed: int = 0,
     reward_label: str = "",
+    start: Source | From | None = None,
 ) -> Request:
     """A policy trained on ``reward`` (a ``reward.pt``) in ``setting``.
 
-    ``reward_label`` tells in the label how the reward was learned. It is not part of the identity.
+    It begins at random, or as ``start``: the ``policy.pt`` of the student that was trained while
+    the reward was learned. ``reward_label`` tells in the label how the reward was learned. It is not part of the identity.
 
     Outputs ``policy.pt``, ``policy.json`` and ``metrics.parquet``.
 
     Raises:
-        UsageError: a tabular environment, or an option that does not fit its actions.
+        UsageError: a tabular environment, or an algorithm or option that does not fit its actions
+            or the start.
     """
     check_tabular(env, "transfer", wanted=False)
     parameters = Parameters(
         environment=environment_key(env),
         setting=str(setting),
         seed=seed,
-        transfer=relevant_transfer(transfer, environment(env).discrete_actions),
+        transfer=relevant_transfer(
+            transfer, environment(env).discrete_actions, from_student=start is not None
+        ),
     )
     label = f"transfer {env} {setting} seed {seed}"
     label += f" on the reward of {reward_label}" if reward_label else ""
-    return Request(STAGE, parameters, {"reward": reward}, label)
+    label += " from its student" if start is not None else ""
+    inputs = {"reward": reward} | ({} if start is None else {"start": start})
+    return Request(STAGE, parameters, inputs, label)
 
 
 def run(job: Job) -> None:
     """Train on g / scale. The metrics report the true return, which the policy never sees."""
     from irlcli.data.outputs import write_metrics, write_policy
-    from irlcli.data.tensors import load_reward_file
+    from irlcli.data.tensors import load_policy_file, load_reward_file
     from irlcli.learners.frozen import FrozenReward
     from irlcli.rl import algorithm
     from irlcli.rl.loop import LastRound, NoLearner, Training
+    from irlcli.rl.policy import require_observations
     from irlcli.rl.worlds import action_space, make_worlds, observation_size
 
     p: Parameters = job.parameters
-    env, ppo = p.environment.name, p.transfer.ppo
+    env, config, where = (
+        p.environment.name,
+        p.transfer.trained_by,
+        f"{p.environment.name} {p.setting}",
+    )
     settings = [parse_setting(env, p.setting)]
     model, origin = load_reward_file(job.inputs["reward"])
-    with closing(make_worlds(env, settings, ppo.n_envs, job.workers)) as worlds:
+    student = None
+    if "start" in job.inputs:
+        student, about = load_policy_file(job.inputs["start"])
+        if about.agent != "student":
+            raise UsageError(
+                f"the policy to start from is of the agent {about.agent}, not a student",
+                "name the policy.pt beside the reward",
+            )
+        own = ("net_arch", "activation", "normalise_observations", "use_sde")
+        config = replace(config, **{name: getattr(about.network, name) for name in own})
+    with closing(make_worlds(env, settings, config.n_envs, job.workers)) as worlds:
         reward = FrozenReward(
             model,
             origin,
             horizon=p.environment.max_episode_steps,
-            gamma=ppo.gamma,
-            where=f"{env} {p.setting}",
+            gamma=config.gamma,
+            where=where,
             observation_size=observation_size(worlds.observation_space),
             actions=action_space(worlds.action_space),
+            ceiling=p.transfer.ceiling,
         )
         trainer = algorithm(p.transfer.algorithm)(
-            worlds, ppo, p.transfer.total_steps, p.seed, STAGE.name
+            worlds, config, p.transfer.total_steps, p.seed, STAGE.name
         )
+        if student is not None:
+            require_observations(student, worlds.observation_space, where)
+            trainer.policy.load_state_dict(student.state_dict())
         training = Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
         rows = run_training(job, training)
     write_policy(
         job.output,
         trainer.policy,
-        ppo,
+        config,
         env=env,
         agent="transfer",
         settings=(p.setting,),
@@ -97,8 +125,9 @@ def run(job: Job) -> None:
         method=origin.method,
         reward_seed=origin.seed,
         reward_settings=origin.settings,
+        from_student=student is not None,
     )
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("transfer", 2, run)
+STAGE = Stage("transfer", 3, run)

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -17,10 +18,12 @@ from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import parse_setting
-from irlcli.learners.frozen import FrozenReward
+from irlcli.learners.airl import reward_quantiles
+from irlcli.learners.frozen import FrozenReward, bounded_pay
+from irlcli.learners.pools import make_pool
 from irlcli.learners.reward_model import RewardModel
 from irlcli.rl.rollout import roll_out
-from irlcli.trajectories import ActionSpace, Trajectory
+from irlcli.trajectories import ActionSpace, Trajectory, Transitions
 
 
 def by_hand(path, about):
@@ -209,3 +212,110 @@ def test_what_the_reward_cannot_measure_is_refused(tmp_path, smoke_store):
     continuous(tmp_path / "reward.pt", "executed", [[2.0, math.nan]])
     with pytest.raises(IntegrityError, match="not finite"):
         frozen(tmp_path / "reward.pt", 1, BOX)
+
+
+def bounded(network, ceiling, absorbing, terminated):
+    """The pay of two steps s = 1, 4 whose successors are s = 2, 8, for a reward g(s, a) = 2 s + 3 a."""
+    model = RewardModel(**network)
+    model.load_state_dict(
+        {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
+        | {"normaliser.variance": torch.ones(1), "g.0.weight": torch.tensor([[2.0, 3.0]])}
+    )
+    data = Transitions(
+        observations=np.array([[1.0], [4.0]], np.float32),
+        actions=np.array([[1.0], [-1.0]], np.float32),
+        next_observations=np.array([[2.0], [8.0]], np.float32),
+        terminated=np.array([False, terminated]),
+        remaining=np.array([0, 5 * terminated]),
+    )
+    return bounded_pay(model, data, ceiling, absorbing, gamma=0.9).tolist()
+
+
+@pytest.mark.parametrize(
+    ("ceiling", "absorbing", "expected"),
+    [
+        # g is 5 and 5; the absorbing state earns g(8, 0) = 16 times 0.9 / 0.1 once the episode ended.
+        (math.inf, False, [5.0, 5.0]),
+        (math.inf, True, [5.0, 5.0 + 9 * 16.0]),
+        # The ceiling bounds every step of the series, not its sum.
+        (4.5, True, [4.5, 4.5 + 9 * 4.5]),
+        (10.0, True, [5.0, 5.0 + 9 * 10.0]),
+        (-1.0, True, [-1.0, -1.0 + 9 * -1.0]),
+    ],
+)
+def test_the_ceiling_bounds_each_step_before_the_absorbing_series(ceiling, absorbing, expected):
+    network = {
+        "observation_size": 1,
+        "action_size": 1,
+        "discrete": False,
+        "state_only": False,
+        "hidden": (),
+        "activation": "tanh",
+        "gamma": 0.9,
+    }
+    assert bounded(network, ceiling, absorbing, True) == pytest.approx(expected, rel=1e-5)
+
+
+def test_quantiles_weigh_settings_equally_and_absorbing_rows_as_drawn():
+    """g(s) = s. One setting holds 0 and, three times, an absorbing 4; the other ninety-nine 2's."""
+    model = RewardModel(1, 1, False, True, (), "tanh", 0.9)
+    model.load_state_dict(
+        {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
+        | {"normaliser.variance": torch.ones(1), "g.0.weight": torch.ones(1, 1)}
+    )
+
+    def pool(states, remaining):
+        count = len(states)
+        data = Transitions(
+            observations=np.array(states, np.float32)[:, None],
+            actions=np.zeros((count, 1), np.float32),
+            next_observations=np.full((count, 1), 4.0, np.float32),
+            terminated=np.array([remaining > 0] * count),
+            remaining=np.full(count, remaining),
+        )
+        return make_pool(model, data, torch.zeros(count), absorbing=True)
+
+    quantiles = reward_quantiles(model, [pool([0.0], 3), pool([2.0] * 99, 0)])
+    assert len(quantiles) == 101
+    # Weights: 1/8 of 0, 1/2 of 2, 3/8 of 4.
+    assert quantiles[0] == quantiles[12] == 0.0
+    assert quantiles[13] == pytest.approx(2.0) == quantiles[62]
+    assert quantiles[63] == pytest.approx(4.0) == quantiles[100]
+
+
+def test_a_trained_reward_carries_its_quantiles_and_a_ceiling_bounds_what_it_pays(smoke_store):
+    path = smoke_store.path / smoke_store.airl / "reward.pt"
+    model, origin = load_reward_file(path)
+    quantiles = np.array(origin.quantiles)
+    assert (np.diff(quantiles) >= 0).all() and quantiles[0] < quantiles[-1]
+    four = ActionSpace(True, 4, np.empty(0), np.empty(0))
+    rng = np.random.default_rng(0)
+    states = rng.normal(0, 3, (1, 500, 8)).astype(np.float32)
+    rollout = SimpleNamespace(
+        transitions=lambda *_: Transitions(
+            observations=states[0],
+            actions=rng.integers(4, size=500),
+            next_observations=states[0],
+            terminated=np.zeros(500, bool),
+            remaining=np.zeros(500, np.int64),
+        ),
+        terminated=np.zeros((1, 500), bool),
+    )
+    rewards = {}
+    for ceiling in (None, 0.5):
+        reward = FrozenReward(model, origin, 1000, 0.9, "x", 8, four, ceiling)
+        rng = np.random.default_rng(1)
+        rewards[ceiling] = reward.rewards(rollout, None)
+    bound = quantiles[50] / origin.scale
+    assert rewards[None].max() > bound
+    np.testing.assert_allclose(rewards[0.5], np.minimum(rewards[None], bound), rtol=1e-5)
+
+
+def test_a_ceiling_needs_a_reward_with_quantiles(tmp_path):
+    continuous(tmp_path / "reward.pt", "executed")
+    model, origin = load_reward_file(tmp_path / "reward.pt")
+    with pytest.raises(
+        UsageError, match="needs the quantiles of g on the demonstrations"
+    ) as caught:
+        FrozenReward(model, origin, 1000, 0.9, "x", 1, BOX, 0.9)
+    assert "omit transfer.ceiling" in caught.value.hint

@@ -1,0 +1,158 @@
+"""Retraining through the real command line: SAC, a ceiling, the student as a start."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from irlcli.data.tensors import load_policy_file
+from irlcli.store import Store
+
+
+@pytest.fixture(scope="module")
+def cheetah(tmp_path_factory, run_irl):
+    """A store with a reward ``airl`` of HalfCheetah."""
+    store = tmp_path_factory.mktemp("cheetah") / "runs"
+    common = ["--store", str(store), "--profile", "smoke", "--quiet", "--name"]
+    intervention = ["--env", "half-cheetah", "--intervention", "friction"]
+    for arguments in (
+        ["collect-experts", *intervention, *common, "demos"],
+        ["train-airl", "--demos", "demos", "--method", "erm", *common, "airl"],
+    ):
+        done = run_irl(arguments)
+        assert done.code == 0, done.err
+    return store
+
+
+@pytest.fixture
+def runs(cheetah, tmp_path):
+    """A copy of that store."""
+    return shutil.copytree(cheetah, tmp_path / "cheetah", symlinks=True)
+
+
+def common(store):
+    return ["--store", str(store), "--profile", "smoke", "--quiet"]
+
+
+SAC = ["transfer", "--reward", "airl", "--ood", "friction", "--algorithm", "sac"]
+
+
+def made(store, done):
+    assert done.code == 0, done.err
+    return Store(store).resolve(done.out.strip().rpartition("/")[2]).artefact
+
+
+def test_sac_end_to_end(runs, irl):
+    artefact = made(runs, irl(*SAC, *common(runs), "--name", "moved"))
+    parameters = artefact.manifest.record.parameters["transfer"]
+    assert parameters["algorithm"] == "sac"
+    about = json.loads((artefact.directory / "policy.json").read_text())
+    assert about["agent"] == "transfer" and about["network"]["squashed"]
+    policy, _ = load_policy_file(artefact.directory / "policy.pt")
+    observations = np.random.default_rng(0).normal(0, 5, (50, 17)).astype(np.float32)
+    assert np.abs(policy.act(observations)).max() <= 1.0
+    score = irl("evaluate", "--policy", "moved", "--reward", "airl", *common(runs))
+    assert score.code == 0 and "AIRL-ERM retrained policy" in score.err
+    again = irl(*SAC, *common(runs), "--dry-run")
+    assert again.out.startswith("HIT")
+
+
+def test_sac_killed_and_run_again_gives_the_same_bytes(runs, tmp_path):
+    """Killed by SIGINT it writes a checkpoint, replay buffer included, from which it resumes."""
+    longer = ["--set", "transfer.total_steps=20480"]
+    command = [sys.executable, "-m", "irlcli", *SAC, *longer, "--profile", "smoke"]
+    whole = tmp_path / "whole"
+    shutil.copytree(runs, whole, symlinks=True)
+    subprocess.run([*command, "--store", whole], check=True, capture_output=True)
+    process = subprocess.Popen(
+        [*command, "--store", runs], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    for line in process.stderr:
+        if "steps" in line and "/" in line:
+            process.send_signal(signal.SIGINT)
+            break
+    process.communicate()
+    assert process.returncode == 130
+    done = subprocess.run([*command, "--store", runs], check=True, capture_output=True, text=True)
+    resumed = Store(runs).resolve(done.stdout.strip().rpartition("/")[2]).artefact
+    assert resumed.provenance()["resumed"] == 1
+    assert resumed.id in Store(whole).ids()
+
+
+@pytest.mark.parametrize("words", [["--start", "student"], ["--start", "student", "--seed", "3"]])
+def test_the_retrained_policy_begins_as_the_student(runs, irl, words, monkeypatch):
+    """Its first actions are the student's, before any update; its moments go on."""
+    from irlcli.rl.ppo import PPOTrainer
+
+    first = {}
+    original = PPOTrainer.train_round
+
+    def spied(self, index, source):
+        if index == 0:
+            first.update({name: t.clone() for name, t in self.policy.state_dict().items()})
+        return original(self, index, source)
+
+    student, about = load_policy_file(Store(runs).resolve("airl").artefact.directory / "policy.pt")
+    monkeypatch.setattr(PPOTrainer, "train_round", spied)
+    command = ["transfer", "--reward", "airl", "--ood", "friction", *words]
+    artefact = made(runs, irl(*command, *common(runs)))
+    expected = student.state_dict()
+    assert first.keys() == expected.keys()
+    assert all(torch.equal(first[name], expected[name]) for name in expected)
+    parameters = artefact.manifest.record.parameters["transfer"]
+    assert parameters["total_steps"] == 2048
+    assert parameters["ppo"]["learning_rate"] == 1e-4
+    assert parameters["ppo"]["learning_rate_schedule"] == "linear"
+    moved, description = load_policy_file(artefact.directory / "policy.pt")
+    assert description.from_student and description.network == about.network
+    count = "features_extractor.normaliser.count"
+    assert moved.state_dict()[count] == expected[count] + 2048
+    inputs = artefact.manifest.record.inputs
+    assert set(inputs) == {"reward", "start"}
+    scratch = made(runs, irl(*command[:5], *common(runs)))
+    assert scratch.id != artefact.id
+    # Outside the store the student is found beside the reward, with the same key.
+    outside = runs.parent / "copied"
+    shutil.copytree(Store(runs).resolve("airl").artefact.directory, outside)
+    command[2] = str(outside / "reward.pt")
+    assert made(runs, irl(*command, *common(runs))).id == artefact.id
+    os.chmod(outside, 0o755)
+    (outside / "policy.pt").unlink()
+    missing = irl(*command, *common(runs))
+    assert missing.code == 3 and "there is no student beside" in missing.err
+
+
+def test_a_ceiling_changes_the_policy_and_evaluations_stay_unbounded(runs, irl):
+    command = ["transfer", "--reward", "airl", "--ood", "friction"]
+    plain = made(runs, irl(*command, *common(runs)))
+    low = made(runs, irl(*command, "--set", "transfer.ceiling=0.1", *common(runs), "--name", "low"))
+    policies = [(a.directory / "policy.pt").read_bytes() for a in (plain, low)]
+    assert policies[0] != policies[1]
+    done = irl("evaluate", "--policy", "low", "--reward", "airl", *common(runs))
+    assert done.code == 0, done.err
+
+
+def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
+    lander = ["transfer", "--reward", "airl", "--ood", "1.5x", *common(store_copy.path)]
+    own = ["transfer", "--reward", "airl", "--ood", "friction", *common(runs)]
+    for arguments, message, hint in (
+        ([*lander, "--algorithm", "sac"], "SAC needs continuous actions", "--algorithm ppo"),
+        ([*own, "--algorithm", "sca"], "unknown transfer.algorithm 'sca'", "did you mean 'sac'"),
+        ([*own, "--start", "studnet"], "unknown --start 'studnet'", "did you mean 'student'"),
+        (
+            [*own, "--start", "student", "--algorithm", "sac"],
+            "--start student needs PPO",
+            "--algorithm ppo",
+        ),
+        ([*own, "--set", "transfer.ceiling=1.5"], "transfer.ceiling", "none"),
+    ):
+        done = irl(*arguments)
+        assert done.code == 2 and done.out == ""
+        error, told = done.err.strip().splitlines()
+        assert message in error and hint in told
