@@ -20,6 +20,8 @@ def describe(parameters: Mapping[str, Any]) -> str:
     settings = parameters.get("settings")
     parts = [parameters.get("kind"), env, parameters.get("agent")]
     parts += settings if isinstance(settings, list) else [parameters.get("setting")]
+    noise = parameters.get("noise")
+    parts += [f"noise {noise}"] if noise else []
     return _joined([*parts, *_learned(parameters)])
 
 

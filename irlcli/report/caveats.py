@@ -73,11 +73,10 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
         if r.short:
             higher, lower = r.short_scored_higher, r.short - r.short_scored_higher
             parts = [
-                f"The reward scores {higher} of them above the expert, so it prefers a worse policy."
+                f"Wrong reward: it scores {higher} of them at least as high as the expert."
             ] * (higher > 0)
             parts += [
-                f"The reward scores the expert at least as high as {lower} of them, so optimisation "
-                "fell short."
+                f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
             found.append(
                 f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.seeds} retrained "

@@ -20,12 +20,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
+from irlcli.data.descriptions import Measured, Verdict
 from irlcli.report.agents import BASELINES, comparisons
 from irlcli.report.lineage import evaluations, is_mixed, origins
 from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
+from irlcli.report.reward_quality import judge
 from irlcli.report.statistics import compare, holm, paired_p, summarise
 
 # A student imitates if its return is within a fifth of its expert's.
@@ -179,26 +180,40 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
 
     Columns: ``row``, ``agent``; ``seeds`` that have both evaluations; ``retrained`` and
     ``expert``, mean learned returns of the retrained policies and of the held-out setting's expert;
-    ``short``, seeds whose retrained policy does not come within a fifth of the expert's true
-    return; ``short_scored_higher``, those of them that the reward scores above the expert.
+    ``short``, seeds whose retrained policy falls short of the expert, and ``short_scored_higher``,
+    those of them because of a wrong reward: see :func:`irlcli.report.reward_quality.judge`, which
+    also needs the random agent's return.
     """
     columns = ["row", "agent", "seeds", "retrained", "expert", "short", "short_scored_higher"]
     found = []
     for row in p.rows if "transfer" in p.measures else ():
+        random = sample(points, row.name, "random", "ood")["true_return"].mean()
         for method in p.methods:
             of = points[(points["row"] == row.name) & (points["agent"] == method)]
             of = of[of["learned_return"].notna()]
             policies, experts = (of[of["measure"] == m] for m in ("transfer", EXPERT_BY_REWARD))
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
-            if both.empty:
+            if both.empty or math.isnan(random):
                 continue
-            returns = zip(both["true_return"], both["true_return_expert"], strict=True)
-            short = np.array([not imitates(policy, expert) for policy, expert in returns])
-            retrained, expert = both["learned_return"], both["learned_return_expert"]
-            means = float(retrained.mean()), float(expert.mean())
-            counts = int(short.sum()), int((short & (retrained > expert)).sum())
+            verdicts = [_verdict(r, random) for r in both.itertuples()]
+            means = (float(both[n].mean()) for n in ("learned_return", "learned_return_expert"))
+            counts = len(both) - verdicts.count("retrained"), verdicts.count("wrong reward")
             found.append((row.name, method, len(both), *means, *counts))
     return pd.DataFrame(found, columns=columns)
+
+
+def _verdict(seed: Any, random: float) -> Verdict:
+    """On a seed's retrained policy. Points hold means only, so no standard errors are known."""
+    earned, best, worst, gap = (
+        Measured(mean=float(value), error=None)
+        for value in (
+            seed.true_return,
+            seed.true_return_expert,
+            random,
+            seed.learned_return_expert - seed.learned_return,
+        )
+    )
+    return judge(earned, best, worst, gap).verdict
 
 
 def discriminator_ends(p: Parameters, learning: Learning) -> pd.DataFrame:

@@ -28,10 +28,10 @@ _MAIN_NOTE = (
 _LEARNED_NOTE = (
     "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
     "discounts), mean over seeds; of the policy retrained on that reward, and of the held-out "
-    "setting's expert. Short: seeds whose retrained policy has a true return more than a fifth below "
-    "the expert's. Scored higher: those of them that the reward scores above the expert, so that it "
-    "prefers a worse policy. In the others, optimisation fell short, which does not show that the "
-    "reward is right. The unit is the standard deviation of g on the training data; zero has no "
+    "setting's expert. Short: seeds whose retrained policy has a regret of more than 10 % of what the "
+    "expert earns above the random agent. Scored higher: those of them that the reward scores at least "
+    "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
+    "show that the reward is right. The unit is the standard deviation of g on the training data; zero has no "
     "meaning."
 )
 _COMPARISON_NOTE = (

@@ -139,8 +139,10 @@ def agreement(members: Sequence[Member], lower: bool = False, seed: int = 0) -> 
     at_random = rng.integers(episodes, size=(_RESAMPLES, *shape, episodes))
 
     def resampled(values: np.ndarray) -> np.ndarray:
-        means = np.take_along_axis(values[drawn], at_random, -1).mean(-1)
-        return means.reshape(_RESAMPLES, -1)
+        means = np.take_along_axis(values[None], at_random, -1).mean(-1)
+        # A policy that is drawn twice has the same episodes both times. Two draws of them would
+        # differ by noise alone, and spoil a perfect order.
+        return np.take_along_axis(means, drawn[..., None], 1).reshape(_RESAMPLES, -1)
 
     def chosen(values: np.ndarray, here: np.ndarray) -> np.ndarray:
         return lower_half(values, here) if lower else here

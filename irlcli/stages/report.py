@@ -84,4 +84,4 @@ def run(job: Job) -> None:
     (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, curves))
 
 
-STAGE = Stage("report", 9, run)
+STAGE = Stage("report", 10, run)

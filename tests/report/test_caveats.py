@@ -51,15 +51,15 @@ def test_a_saturated_discriminator_without_cross_entropy():
 def test_a_wrong_reward_and_a_failed_optimisation_are_told_apart():
     pairs = {
         (BOUNCE, "erm"): [(4, 1), (5, 1), (9, 10)],
-        (BOUNCE, "irm"): [(1, 2), (1, 1), (1, 2)],
+        (BOUNCE, "irm"): [(1, 2), (1, 3), (1, 2)],
     }
     erm, irm = (c for c in scored(pairs).caveats if c.startswith("Short of the expert"))
     assert erm.startswith(f"Short of the expert: {BOUNCE}, AIRL-ERM: 3 of 3 retrained policies. ")
-    assert "scores 2 of them above the expert" in erm
-    assert "scores the expert at least as high as 1 of them, so optimisation fell short" in erm
+    assert "Wrong reward: it scores 2 of them at least as high as the expert." in erm
+    assert "Optimisation fell short: the reward scores the expert above 1 of them." in erm
     assert irm.startswith(f"Short of the expert: {BOUNCE}, AIRL-IRM: 3 of 3 retrained policies. ")
-    assert "prefers a worse policy" not in irm
-    assert "scores the expert at least as high as 3 of them" in irm
+    assert "Wrong reward" not in irm
+    assert "the reward scores the expert above 3 of them" in irm
 
 
 def test_missing_evaluations_and_tests():

@@ -46,7 +46,7 @@ def test_learned_returns_stand_side_by_side():
     }
     assert [line[2:] for line in table(scored(pairs), "Learned returns").rows] == [
         ["3", "6.0", "4.0", "3/3", "2/3"],
-        ["3", "1.0", "1.7", "3/3", "0/3"],
+        ["3", "1.0", "1.7", "3/3", "1/3"],
     ]
 
 
