@@ -185,34 +185,36 @@ REQUESTS = {
 }
 # Reports read evaluations that are named one by one; no config field reaches them otherwise.
 REPORTS = {"report", "report-experts"}
+# AIRL refuses gSDE, so its frequency is not read. Challengers act in the student's worlds.
+UNREAD_AIRL = ["airl.ppo.sde_sample_freq", "airl.challenger.ppo.n_envs"]
 # What a stage does not read, whatever the other fields are.
 UNREAD = {
     # The bar is for the report of the experts.
     "": ["expert.bar"],
-    # AIRL refuses gSDE, so its frequency is not read.
-    "train-airl": ["airl.ppo.sde_sample_freq"],
-    "transfer": ["airl.ppo.sde_sample_freq"],
-    "transfer by SAC": ["airl.ppo.sde_sample_freq"],
+    "train-airl": UNREAD_AIRL,
+    "transfer": UNREAD_AIRL,
+    "transfer by SAC": UNREAD_AIRL,
     # The student's network, and its own schedule of the learning rate.
     "transfer from the student": [
-        "airl.ppo.sde_sample_freq",
+        *UNREAD_AIRL,
         *(f"transfer.ppo.{n}" for n in ("net_arch", "activation", "ortho_init", "log_std_init")),
         *(f"transfer.ppo.{n}" for n in ("normalise_observations", "use_sde", "sde_sample_freq")),
         *(f"transfer.ppo.{n}" for n in ("learning_rate", "learning_rate_schedule")),
     ],
-    "evaluate": ["airl.ppo.sde_sample_freq"],
-    "record": ["airl.ppo.sde_sample_freq"],
-    "assess": ["airl.ppo.sde_sample_freq"],
+    "evaluate": UNREAD_AIRL,
+    "record": UNREAD_AIRL,
+    "assess": UNREAD_AIRL,
     # Both are replaced: the weight by the candidates, the selection by the request above.
     "choose-penalty": [
-        *("airl.ppo.sde_sample_freq", "airl.penalty_weight"),
+        *(*UNREAD_AIRL, "airl.penalty_weight"),
         *("airl.select", "airl.select_episodes"),
     ],
     # The sweep's variants replace these.
     "sweep-maxent": [f"maxent.{n}" for n in ("grouping", "penalty", "penalty_weight", "l2")],
     "figure2": [f"maxent.{n}" for n in ("grouping", "penalty", "penalty_weight", "l2")],
 }
-REFUSED = ["airl.ppo.use_sde"]
+# Challengers need logits without log pi.
+REFUSED = ["airl.ppo.use_sde", "airl.logit"]
 # Fields whose type does not tell another valid value.
 CHANGED = {
     "expert.bar": 1.0,
@@ -252,6 +254,10 @@ def in_use() -> Config:
         "transfer.ppo.sde_sample_freq": 4,
         # A multiple of two and of three settings.
         "airl.ppo.n_envs": 12,
+        "airl.logit": "f",
+        "airl.challenger.life": 3,
+        "airl.challenger.ppo.use_sde": True,
+        "airl.challenger.ppo.sde_sample_freq": 4,
         "airl.grouping": "per-setting",
         "airl.penalty": "irmv1",
         "airl.select": str(SETTINGS[0]),
@@ -354,7 +360,15 @@ IRRELEVANT = [
     (
         airl,
         {"airl.replay_share": 0.0},
-        ["airl.replay_episodes_per_round", "airl.replay_capacity"],
+        [
+            *("airl.replay_episodes_per_round", "airl.challenger.replay_episodes_per_round"),
+            *("airl.replay_capacity", "airl.challenger.replay_capacity"),
+        ],
+    ),
+    (
+        airl,
+        {"airl.challenger.life": 0},
+        [path for path in FIELDS if path.startswith("airl.challenger.")][1:],
     ),
     (airl, {"airl.select": "last"}, ["airl.select_every", "airl.select_episodes"]),
     (airl, {"airl.select": "episodes"}, ["airl.select_episodes"]),

@@ -4,6 +4,7 @@ from irlcli.configs.load import PROFILES, check_profile, load_config
 from irlcli.configs.schema import (
     AIRLConfig,
     AssessmentConfig,
+    ChallengerConfig,
     CloneConfig,
     Config,
     DemonstrationConfig,
@@ -24,6 +25,7 @@ __all__ = [
     "AIRLConfig",
     "AssessmentConfig",
     "CloneConfig",
+    "ChallengerConfig",
     "Config",
     "DemonstrationConfig",
     "EvaluationConfig",

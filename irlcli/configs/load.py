@@ -15,7 +15,14 @@ import msgspec
 from msgspec import Struct
 
 from irlcli.configs.relevance import check_registered
-from irlcli.configs.schema import Config, ExpertConfig, InterventionConfig, TransferConfig
+from irlcli.configs.schema import (
+    AIRLConfig,
+    Config,
+    ExpertConfig,
+    InterventionConfig,
+    PPOConfig,
+    TransferConfig,
+)
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
 from irlcli.interventions import knob_of, overlap, parse_settings
@@ -98,7 +105,16 @@ def _stack(env: str, layers: Sequence[tuple[str, Mapping[str, Any]]]) -> Config:
         )
         for knob, intervention in config.interventions.items()
     }
-    return msgspec.structs.replace(config, interventions=interventions)
+    config = msgspec.structs.replace(config, interventions=interventions)
+    return msgspec.structs.replace(config, airl=_with_challenger(config, tree))
+
+
+def _with_challenger(config: Config, tree: Mapping[str, Any]) -> AIRLConfig:
+    """Challengers learn as retrained policies do, unless ``[airl.challenger.ppo]`` differs."""
+    own = tree.get("airl", {}).get("challenger", {}).get("ppo", {})
+    ppo = msgspec.convert(_merge(tree.get("transfer", {}).get("ppo", {}), own), PPOConfig)
+    challenger = msgspec.structs.replace(config.airl.challenger, ppo=ppo)
+    return msgspec.structs.replace(config.airl, challenger=challenger)
 
 
 def _of_knob(

@@ -95,11 +95,28 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         airl = replace(airl, activation=_AIRL.activation)
     if airl.grouping == "pooled":
         airl = replace(airl, pairing=_AIRL.pairing)
+    if airl.challenger.life == 0:
+        airl = replace(airl, challenger=_AIRL.challenger)
+    else:
+        if airl.logit != "f":
+            raise UsageError(
+                f"airl.challenger.life = {airl.challenger.life} needs logits without log pi: past "
+                "challengers, whose log pi they would hold, are gone",
+                "--set airl.logit=f, and --set airl.policy_reward to f or g",
+            )
+        ppo = relevant_ppo(airl.challenger.ppo, discrete_actions, "airl.challenger.ppo")
+        ppo = replace(ppo, n_envs=airl.ppo.n_envs)
+        airl = replace(airl, challenger=replace(airl.challenger, ppo=ppo))
     if airl.replay_share == 0.0:
         airl = replace(
             airl,
             replay_episodes_per_round=_AIRL.replay_episodes_per_round,
             replay_capacity=_AIRL.replay_capacity,
+            challenger=replace(
+                airl.challenger,
+                replay_episodes_per_round=_AIRL.challenger.replay_episodes_per_round,
+                replay_capacity=_AIRL.challenger.replay_capacity,
+            ),
         )
     if airl.select == "last":
         airl = replace(airl, select_every=_AIRL.select_every)

@@ -162,6 +162,29 @@ class DemonstrationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     deterministic: bool = False
 
 
+class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Policies trained from random weights while the reward is learned, as it will be used.
+
+    A challenger is trained on the current g, in the settings trained on. Its episodes are
+    negatives, so the reward corrects the states that a new policy goes through.
+
+    Attributes:
+        life: rounds after which the next challenger starts from random weights; 0 for none.
+        share: weight of the cross-entropy between challengers and experts in the loss.
+        ceiling: quantile of g on the demonstrations that bounds a challenger's reward.
+        replay_episodes_per_round, replay_capacity: episodes a setting that each round adds, and
+            that are kept, every round's with the same probability.
+        ppo: as ``[transfer.ppo]`` where a settings file is silent; in the student's worlds.
+    """
+
+    life: NonNegativeCount = 0
+    share: Fraction = 0.5
+    ceiling: Fraction = 0.9
+    replay_episodes_per_round: Count = 2
+    replay_capacity: Count = 200
+    ppo: PPOConfig = PPOConfig()
+
+
 class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Adversarial IRL (paper Sec. 4.3, Algorithm 1, App. C).
 
@@ -174,6 +197,12 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             the warm-up rounds and then raised linearly over the ramp rounds.
         penalty_scaling: w multiplies the whole ``logit``, or only f (``reward``).
         penalty_estimate: ``unbiased`` (product of two half-batches' gradients) or ``square``.
+        logit: what the discriminator is the sigmoid of: ``f-log-pi`` (paper Eq. 2), or ``f``.
+        shaping: f has the shaping term gamma h(s') - h(s); otherwise f is g.
+        learning_rate_schedule: of the discriminator. ``linear`` falls to zero over the rounds, so
+            that the last challengers meet a reward that hardly changes any more.
+        gradient_penalty: weight of the mean squared gradient of g by its input, between the
+            policy's samples and the expert's. It keeps g from saturating.
         weight_decay: decoupled (AdamW), so that its strength does not depend on lambda.
         replay_share: share of the discriminator's policy samples that come from past rounds;
             each round adds ``replay_episodes_per_round`` episodes a setting, of which
@@ -202,7 +231,11 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     state_only: bool = False
     hidden: Widths = (32, 32)
     activation: Activation = "tanh"
+    logit: Literal["f-log-pi", "f"] = "f-log-pi"
+    shaping: bool = True
     learning_rate: Positive = 3e-4
+    learning_rate_schedule: Schedule = "constant"
+    gradient_penalty: NonNegative = 0.0
     weight_decay: NonNegative = 1e-4
     max_grad_norm: Positive = 1.0
     updates_per_round: Count = 10
@@ -218,6 +251,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     select: str = "last"
     select_every: Count = 10
     select_episodes: Count = 10
+    challenger: ChallengerConfig = ChallengerConfig()
     ppo: PPOConfig = PPOConfig()
 
 

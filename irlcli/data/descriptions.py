@@ -42,6 +42,7 @@ class RewardNetwork(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     hidden: Widths
     activation: Activation
     gamma: Discount
+    shaping: bool
 
 
 class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

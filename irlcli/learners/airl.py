@@ -2,7 +2,8 @@
 
 Algorithm 1, as this module reads from top to bottom. In every round
 
-1. the policy acts and is updated on the discriminator's reward (:meth:`AIRL.rewards`);
+1. the policy acts and is updated on the discriminator's reward (:meth:`AIRL.rewards`), and a
+   challenger, if there is one, on the reward alone (:class:`irlcli.learners.frozen.Pay`);
 2. the round's episodes become samples labelled *policy*, the demonstrations samples labelled
    *expert*, grouped into risks (:meth:`AIRL.update`);
 3. the discriminator minimises :func:`discriminator_loss`, the mean of the risks' cross-entropies
@@ -21,19 +22,33 @@ the horizon would show it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from msgspec.structs import asdict
-from torch.nn.functional import softplus
 
 from irlcli.configs.schema import AIRLConfig
 from irlcli.data.descriptions import RewardNetwork
 from irlcli.errors import StageFailed
 from irlcli.learners.actions import ActionView, Policy
 from irlcli.learners.cloning import clone
+from irlcli.learners.discriminator import (
+    Loss,
+    cross_entropy,
+    discriminator_logits,
+    discriminator_loss,
+    gradient_penalty,
+    penalty_weight_at,
+)
 from irlcli.learners.grouping import Group, Part, apportion, group
+from irlcli.learners.pay import (
+    bounded_pay,
+    level_of,
+    policy_reward,
+    reward_quantiles,
+    reward_scale,
+)
 from irlcli.learners.pools import (
     Minibatch,
     Pool,
@@ -60,118 +75,6 @@ from irlcli.trajectories import (
 _DIAGNOSTIC_SAMPLES = 1024
 
 
-# The loss
-
-
-def discriminator_logits(model: RewardModel, batch: Minibatch) -> tuple[torch.Tensor, torch.Tensor]:
-    """(f - log pi, f), each [E, 2, B]. The sigmoid of the first is D (paper Eq. 2)."""
-    f = model(batch.observations, batch.actions, batch.next_observations, batch.terminated)
-    return f - batch.log_probs, f
-
-
-def cross_entropy(logits: torch.Tensor) -> torch.Tensor:
-    """Binary cross-entropy [E] of ``logits`` [E, 2, B], labels weighted equally.
-
-    Paper Eq. 3 with its sign corrected: expert = 1, policy = 0, to be minimised.
-    """
-    return 0.5 * (softplus(logits[:, 0]).mean(-1) + softplus(-logits[:, 1]).mean(-1))
-
-
-class Loss(NamedTuple):
-    """A minibatch's loss and what it consists of, all scalar tensors."""
-
-    total: torch.Tensor
-    cross_entropy: torch.Tensor
-    penalty: torch.Tensor
-
-
-def discriminator_loss(
-    logits: torch.Tensor,
-    f: torch.Tensor,
-    weights: torch.Tensor,
-    one_risk: bool,
-    penalty: str,
-    penalty_weight: float,
-    options: PenaltyOptions,
-) -> Loss:
-    """(sum_e w_e BCE_e + lambda penalty) / max(1, lambda) (paper Eq. 5, Algorithm 1).
-
-    The paper sums over settings where this averages. Dividing by lambda keeps the gradient's size
-    when the penalty dominates.
-
-    Args:
-        logits: f - log pi [E, 2, B].
-        f: the learned part [E, 2, B].
-        weights: w [E], in sum one.
-        one_risk: whether the penalty sees all E as one risk (``balanced``).
-        penalty: a key of ``irlcli.penalties.PENALTIES``.
-        penalty_weight: lambda, at least 0.
-        options: how the penalty is estimated.
-    """
-    risks = cross_entropy(logits)
-    risk = (weights * risks).sum()
-    seen = (logits, f, risks)
-    if one_risk:
-        seen = (_merged(logits), _merged(f), risk[None])
-    penalised = discriminator_penalty(penalty)(*seen, options)
-    total = risk
-    if penalty_weight > 0.0:
-        total = (risk + penalty_weight * penalised) / max(1.0, penalty_weight)
-    return Loss(total, risk.detach(), penalised.detach())
-
-
-def _merged(samples: torch.Tensor) -> torch.Tensor:
-    """[E, 2, B] as one risk [1, 2, E * B]."""
-    return samples.transpose(0, 1).reshape(1, 2, -1)
-
-
-def penalty_weight_at(index: int, weight: float, warmup: int, ramp: int) -> float:
-    """lambda of round ``index``: 0 for ``warmup`` rounds, then linear over ``ramp`` to ``weight``."""
-    if index < warmup:
-        return 0.0
-    return weight * min(1.0, (index - warmup + 1) / max(1, ramp))
-
-
-# The policy's reward
-
-
-def policy_reward(
-    model: RewardModel,
-    data: Transitions,
-    log_probs: torch.Tensor,
-    form: str,
-    absorbing: bool,
-    gamma: float,
-) -> torch.Tensor:
-    """The reward of each transition [B] float32, without gradient.
-
-    ``form`` is ``f-log-pi`` (log D - log(1 - D), Algorithm 1), ``f`` or ``g``. With ``absorbing``,
-    a terminated transition also earns the discounted sum of its absorbing state's rewards for a
-    policy that discounts by ``gamma``: gamma / (1 - gamma) times the reward there, where log pi is
-    zero.
-    """
-    with torch.no_grad():
-        observations = torch.as_tensor(data.observations)
-        actions = model.encode(torch.as_tensor(data.actions))
-        successors = torch.as_tensor(data.next_observations)
-        terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
-        if form == "g":
-            reward = model.reward(observations, actions)
-        else:
-            ends = torch.zeros_like(terminated) if absorbing else terminated
-            reward = model(observations, actions, successors, ends)
-        if form == "f-log-pi":
-            reward = reward - log_probs
-        if absorbing and bool(terminated.any()):
-            g, f = model.absorbing_reward(successors)
-            series = gamma / (1.0 - gamma)
-            reward = reward + terminated * series * (g if form == "g" else f)
-        return reward
-
-
-# The learner
-
-
 class AIRL:
     """The discriminator, its optimiser, the demonstrations and the replay.
 
@@ -179,6 +82,7 @@ class AIRL:
         demonstrations: episodes of each of E settings.
         config: hyperparameters.
         worlds: number of worlds, equal shares of each setting, setting-major.
+        rounds: of the whole training.
         horizon: time limit of the environment [steps].
         observation_size: D.
         actions: the environment's actions.
@@ -193,6 +97,7 @@ class AIRL:
         demonstrations: Sequence[Sequence[Trajectory]],
         config: AIRLConfig,
         worlds: int,
+        rounds: int,
         horizon: int,
         observation_size: int,
         actions: ActionSpace,
@@ -200,6 +105,7 @@ class AIRL:
     ):
         self.config = config
         self.view = ActionView(config.actions, actions)
+        self._rounds = rounds
         self._horizon = horizon
         self._seed = seed
         self._settings = len(demonstrations)
@@ -226,6 +132,7 @@ class AIRL:
             hidden=config.hidden,
             activation=config.activation,
             gamma=config.ppo.gamma,
+            shaping=config.shaping,
         )
         torch.manual_seed(derive("discriminator", seed, -1)[0])
         self.model = RewardModel(**asdict(self.network))
@@ -239,6 +146,11 @@ class AIRL:
         )
         self._replay = Replay(
             self._settings, config.replay_episodes_per_round, config.replay_capacity
+        )
+        self._challenger_replay = Replay(
+            self._settings,
+            config.challenger.replay_episodes_per_round,
+            config.challenger.replay_capacity,
         )
         # Standard deviation of g on the last round's samples.
         self.scale = 1.0
@@ -271,10 +183,26 @@ class AIRL:
         )
         return reward.numpy().reshape(rollout.terminated.shape)
 
+    def challenger_rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
+        """The rewards [T, N] of a challenger: the current g, bounded as in ``ChallengerConfig``."""
+        data = self.view.of(rollout.transitions(slice(None), self._horizon))
+        reward = bounded_pay(
+            self.model,
+            data,
+            level_of(self.quantiles, self.config.challenger.ceiling),
+            self.config.fixed_horizon,
+            self.config.challenger.ppo.gamma,
+        )
+        return reward.numpy().reshape(rollout.terminated.shape)
+
     def update(
-        self, index: int, rollouts: Sequence[Rollout], policy: Policy
+        self,
+        index: int,
+        rollouts: Sequence[Rollout],
+        policy: Policy,
+        challenge: Sequence[Rollout] = (),
     ) -> list[dict[str, float]]:
-        """Train the discriminator on the rollouts of round ``index``.
+        """Train the discriminator on the rollouts of round ``index`` and those of a challenger.
 
         Returns the diagnostics of each setting: ``cross_entropy``, ``accuracy``, ``mean_abs_logit``
         and ``penalty`` (IRMv1) on fresh samples of the current policy and that setting's
@@ -291,25 +219,22 @@ class AIRL:
             config.penalty_warmup_rounds,
             config.penalty_ramp_rounds,
         )
-        generated, episodes = self._generated(rollouts)
+        generated, challenged = self._generated(rollouts), self._generated(challenge)
         self.model.normaliser.update(
-            torch.as_tensor(np.concatenate([data.observations for data in generated]))
+            torch.as_tensor(np.concatenate([d.observations for d, _ in (*generated, *challenged)]))
         )
-        current = [self._pool(data, policy) for data in generated]
+        current = [self._pool(data, policy) for data, _ in generated]
         expert = [self._pool(join(episodes), policy) for episodes in self._demonstrations]
-        risks = self._risks(current, expert, policy)
+        sources = [self._risks(current, self._replay, expert, policy)]
+        if challenged:
+            pools = [self._pool(data, None) for data, _ in challenged]
+            sources.append(self._risks(pools, self._challenger_replay, expert, None))
         generator = torch.Generator().manual_seed(derive("discriminator", self._seed, index)[0])
+        self._set_learning_rate(index)
         losses = []
         for _ in range(config.updates_per_round):
-            batch = sample_minibatch(risks, generator, config.replay_share)
-            loss = discriminator_loss(
-                *discriminator_logits(self.model, batch),
-                self._weights,
-                config.grouping == "balanced",
-                config.penalty,
-                weight,
-                self._penalty_options,
-            )
+            batches = [sample_minibatch(s, generator, config.replay_share) for s in sources]
+            loss = self._loss(batches, weight, generator)
             self._optimizer.zero_grad()
             loss.total.backward()
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
@@ -322,8 +247,9 @@ class AIRL:
             )
         if config.replay_share > 0.0:
             rng = np.random.default_rng(derive("replay", self._seed, index)[0])
-            for setting, (data, numbers) in enumerate(zip(generated, episodes, strict=True)):
-                self._replay.add(setting, data, numbers, rng)
+            for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
+                for setting, (data, numbers) in enumerate(found):
+                    replay.add(setting, data, numbers, rng)
         self.scale = reward_scale(self.model, [*current, *expert])
         optimised_cross_entropy, optimised_penalty = np.mean(losses, 0)
         return [
@@ -336,26 +262,66 @@ class AIRL:
             for diagnostics in self._diagnostics(current, expert, generator)
         ]
 
-    def _generated(self, rollouts: Sequence[Rollout]) -> tuple[list[Transitions], list[np.ndarray]]:
-        """Each setting's transitions of this round, and the numbers of their episodes."""
-        data, numbers = [], []
-        for setting in range(self._settings):
-            worlds = self._world_settings == setting
-            found, episodes = whole_episodes(rollouts, worlds, self._horizon)
-            data.append(self.view.of(found))
-            numbers.append(episodes)
-        return data, numbers
+    def _loss(
+        self, batches: Sequence[Minibatch], weight: float, generator: torch.Generator
+    ) -> Loss:
+        """The loss on a minibatch of the student's samples, and one of a challenger's."""
+        config = self.config
+        logits = [discriminator_logits(self.model, batch, config.logit) for batch in batches]
+        share, beside = 1.0, torch.zeros(())
+        for challenged, _ in logits[1:]:
+            share = 1.0 - config.challenger.share
+            risk = (self._weights * cross_entropy(challenged)).sum()
+            beside = beside + config.challenger.share * risk
+        if config.gradient_penalty > 0.0:
+            slopes = []
+            for batch in batches:
+                mix = torch.rand(*batch.log_probs[:, 0].shape, 1, generator=generator)
+                slopes.append(gradient_penalty(self.model, batch, mix))
+            beside = beside + config.gradient_penalty * torch.stack(slopes).mean()
+        return discriminator_loss(
+            *logits[0],
+            self._weights,
+            config.grouping == "balanced",
+            config.penalty,
+            weight,
+            self._penalty_options,
+            share,
+            beside,
+        )
 
-    def _pool(self, data: Transitions, policy: Policy) -> Pool:
-        log_probs = self.view.log_prob(policy, data)
+    def _set_learning_rate(self, index: int) -> None:
+        if self.config.learning_rate_schedule == "linear":
+            rate = self.config.learning_rate * max(0.0, 1.0 - index / self._rounds)
+            for group in self._optimizer.param_groups:
+                group["lr"] = rate
+
+    def _generated(self, rollouts: Sequence[Rollout]) -> list[tuple[Transitions, np.ndarray]]:
+        """Each setting's transitions of this round, and the numbers of their episodes."""
+        found = []
+        for setting in range(self._settings if rollouts else 0):
+            worlds = self._world_settings == setting
+            data, episodes = whole_episodes(rollouts, worlds, self._horizon)
+            found.append((self.view.of(data), episodes))
+        return found
+
+    def _pool(self, data: Transitions, policy: Policy | None) -> Pool:
+        """``data`` with log pi of ``policy``; without it, for logits that are f alone."""
+        log_probs = torch.zeros(len(data))
+        if policy is not None and self.config.logit == "f-log-pi":
+            log_probs = self.view.log_prob(policy, data)
         return make_pool(self.model, data, log_probs, self.config.fixed_horizon)
 
     def _risks(
-        self, current: Sequence[Pool], expert: Sequence[Pool], policy: Policy
+        self,
+        current: Sequence[Pool],
+        replay: Replay,
+        expert: Sequence[Pool],
+        policy: Policy | None,
     ) -> list[list[Stratum]]:
         """What each risk's minibatch is drawn from. Every method draws as many samples."""
         # Every round adds to every setting, so all of them have a past or none has.
-        past = [self._pool(data, policy) for data in self._replay.transitions()]
+        past = [self._pool(data, policy) for data in replay.transitions()]
         size = self.config.batch_size * self._settings // len(self._groups)
 
         def paired(pools: Sequence[Pool], part: Part) -> list[Pool]:
@@ -395,7 +361,7 @@ class AIRL:
         ]
         with torch.no_grad():
             batch = sample_minibatch(risks, generator)
-            logits, f = discriminator_logits(self.model, batch)
+            logits, f = discriminator_logits(self.model, batch, self.config.logit)
             entropies = cross_entropy(logits)
             measure = discriminator_penalty("irmv1")
             for e in range(self._settings):
@@ -421,13 +387,8 @@ class AIRL:
     @property
     def quantiles(self) -> tuple[float, ...]:
         """Of g on the demonstrations, see :func:`reward_quantiles`."""
-        return reward_quantiles(
-            self.model,
-            [
-                make_pool(self.model, data, torch.zeros(len(data)), self.config.fixed_horizon)
-                for data in map(join, self._demonstrations)
-            ],
-        )
+        pools = [self._pool(join(episodes), None) for episodes in self._demonstrations]
+        return reward_quantiles(self.model, pools)
 
     # Checkpoints and snapshots
 
@@ -438,6 +399,7 @@ class AIRL:
             "optimizer": self._optimizer.state_dict(),
             "scale": self.scale,
             "replay": self._replay.state_dict(),
+            "challenger_replay": self._challenger_replay.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -446,6 +408,7 @@ class AIRL:
         self._optimizer.load_state_dict(state["optimizer"])
         self.scale = state["scale"]
         self._replay.load_state_dict(state["replay"])
+        self._challenger_replay.load_state_dict(state["challenger_replay"])
 
     def snapshot(self) -> dict[str, Any]:
         """A copy of the reward as it is now."""
@@ -456,42 +419,3 @@ class AIRL:
         """Go back to the reward of ``snapshot()``."""
         self.model.load_state_dict(state["model"])
         self.scale = state["scale"]
-
-
-# What the frozen reward is worth
-
-
-def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
-    """Standard deviation of g over the samples of ``pools``, each row as often as drawn.
-
-    Fixed on training data, it makes frozen rewards of different runs comparable. Nothing is
-    centred, which would change what the reward asks for.
-    """
-    with torch.no_grad():
-        g = torch.cat([model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools])
-    return max(float(g.double().std()), 1e-6)
-
-
-def reward_quantiles(model: RewardModel, demonstrations: Sequence[Pool]) -> tuple[float, ...]:
-    """The 0, 1, ... 100 % quantiles of g over the settings' pools of ``demonstrations``.
-
-    Each row counts as often as drawn; all settings weigh the same.
-    """
-    with torch.no_grad():
-        g = [model.reward(pool.observations, pool.actions)[pool.draw] for pool in demonstrations]
-    weights = np.concatenate([np.full(len(values), 1.0 / len(values)) for values in g])
-    found = np.quantile(
-        torch.cat(g).double().numpy(),
-        np.linspace(0.0, 1.0, 101),
-        weights=weights,
-        method="inverted_cdf",
-    )
-    return tuple(float(value) for value in found)
-
-
-def episode_reward(model: RewardModel, data: Transitions, absorbing: bool) -> float:
-    """Undiscounted sum of g over ``data``; with ``absorbing``, up to the horizon."""
-    with torch.no_grad():
-        pool = make_pool(model, data, torch.zeros(len(data)), absorbing)
-        g = model.reward(pool.observations, pool.actions)
-    return float(g.double()[pool.draw].sum())

@@ -6,32 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 
 from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
 from irlcli.learners.actions import ActionView, Policy
-from irlcli.learners.airl import episode_reward
+from irlcli.learners.pay import bounded_pay, episode_reward, level_of
 from irlcli.learners.reward_model import RewardModel
-from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
-
-
-def bounded_pay(
-    model: RewardModel, data: Transitions, ceiling: float, absorbing: bool, gamma: float
-) -> torch.Tensor:
-    """min(g, ``ceiling``) of each transition [B] float32, without gradient.
-
-    With ``absorbing``, a terminated transition also earns the discounted sum of its absorbing
-    state's rewards, gamma / (1 - gamma) times the bounded reward there.
-    """
-    with torch.no_grad():
-        actions = model.encode(torch.as_tensor(data.actions))
-        pay = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
-        terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
-        if absorbing and bool(terminated.any()):
-            g, _ = model.absorbing_reward(torch.as_tensor(data.next_observations))
-            pay = pay + terminated * gamma / (1.0 - gamma) * g.clamp(max=ceiling)
-        return pay
+from irlcli.trajectories import ActionSpace, Rollout, Trajectory, transitions
 
 
 class FrozenReward:
@@ -85,7 +66,7 @@ class FrozenReward:
                     "demonstrations, which this reward's file does not hold",
                     "learn the reward again with irl train-airl, or omit transfer.ceiling",
                 )
-            self._ceiling = float(np.interp(100.0 * ceiling, range(101), origin.quantiles))
+            self._ceiling = level_of(origin.quantiles, ceiling)
         self._model = model
         self._scale = origin.scale
         self._horizon = horizon

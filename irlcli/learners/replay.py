@@ -47,18 +47,22 @@ def starts_by(ended: np.ndarray, latest: int) -> np.ndarray:
 
 
 class Replay:
-    """Episodes of past rounds, for each setting.
+    """A uniform sample of the episodes of all past rounds, for each setting.
+
+    Early episodes stay as likely as late ones (reservoir sampling, Vitter 1985, algorithm R):
+    otherwise the discriminator forgets what the policy no longer does.
 
     Args:
         settings: their number.
         per_round: episodes that a round adds to each setting.
-        capacity: episodes kept of each setting; beyond that, random ones are dropped.
+        capacity: episodes kept of each setting.
     """
 
     def __init__(self, settings: int, per_round: int, capacity: int):
         self._per_round = per_round
         self._capacity = capacity
         self._episodes: list[list[Transitions]] = [[] for _ in range(settings)]
+        self._seen = [0] * settings
 
     def add(
         self, setting: int, data: Transitions, episodes: np.ndarray, rng: np.random.Generator
@@ -67,10 +71,13 @@ class Replay:
         kept = self._episodes[setting]
         numbers = np.unique(episodes)
         chosen = rng.choice(numbers, min(self._per_round, len(numbers)), replace=False)
-        kept += [data.take(np.flatnonzero(episodes == number)) for number in np.sort(chosen)]
-        if len(kept) > self._capacity:
-            survivors = np.sort(rng.choice(len(kept), self._capacity, replace=False))
-            self._episodes[setting] = [kept[i] for i in survivors]
+        for number in np.sort(chosen):
+            episode = data.take(np.flatnonzero(episodes == number))
+            self._seen[setting] += 1
+            if len(kept) < self._capacity:
+                kept.append(episode)
+            elif (place := rng.integers(self._seen[setting])) < self._capacity:
+                kept[place] = episode
 
     def transitions(self) -> list[Transitions]:
         """Each setting's episodes, one after the other; empty before the first round."""
@@ -79,17 +86,19 @@ class Replay:
     def state_dict(self) -> dict[str, Any]:
         """What a resumed run needs: per setting, joined episodes and their lengths."""
         return {
+            "seen": list(self._seen),
             "settings": [
                 {
                     "lengths": torch.tensor([len(e) for e in episodes], dtype=torch.int64),
                     **({} if not episodes else _tensors(join(episodes))),
                 }
                 for episodes in self._episodes
-            ]
+            ],
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from ``state_dict()``."""
+        self._seen = [int(count) for count in state["seen"]]
         self._episodes = []
         for stored in state["settings"]:
             lengths = stored["lengths"].numpy()

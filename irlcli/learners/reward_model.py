@@ -25,6 +25,7 @@ class RewardModel(nn.Module):
         hidden: widths of the hidden layers of g and of h.
         activation: ``tanh`` or ``relu``.
         gamma: discount of the shaping term.
+        shaping: whether f has a shaping term; otherwise f is g.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class RewardModel(nn.Module):
         hidden: Sequence[int],
         activation: str,
         gamma: float,
+        shaping: bool = True,
     ):
         super().__init__()
         self.action_size = action_size
@@ -45,7 +47,7 @@ class RewardModel(nn.Module):
         self.normaliser = ObservationNormaliser(observation_size)
         inputs = observation_size if state_only else observation_size + action_size
         self.g = mlp(inputs, hidden, activation)
-        self.h = mlp(observation_size, hidden, activation)
+        self.h = mlp(observation_size, hidden, activation) if shaping else None
 
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
         """Actions as vectors [B, A]: one-hot if discrete."""
@@ -55,8 +57,12 @@ class RewardModel(nn.Module):
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """g [B] for observations [B, D] and encoded actions [B, A]."""
+        return self.g(self.inputs(observations, action_vectors))[..., 0]
+
+    def inputs(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
+        """What the network g sees [B, D] or [B, D + A]: normalised observations, actions."""
         s = self.normaliser(observations)
-        return self.g(s if self.state_only else torch.cat([s, action_vectors], -1))[..., 0]
+        return s if self.state_only else torch.cat([s, action_vectors], -1)
 
     def forward(
         self,
@@ -66,9 +72,11 @@ class RewardModel(nn.Module):
         terminated: torch.Tensor,
     ) -> torch.Tensor:
         """f [B]; ``terminated`` [B] in {0, 1} removes the value of the successor."""
+        g = self.reward(observations, action_vectors)
+        if self.h is None:
+            return g
         h = self.h(self.normaliser(observations))[..., 0]
         h_next = self.h(self.normaliser(next_observations))[..., 0]
-        g = self.reward(observations, action_vectors)
         return g + self.gamma * h_next * (1.0 - terminated) - h
 
     def absorbing_reward(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -79,5 +87,7 @@ class RewardModel(nn.Module):
         """
         none = torch.zeros(*observations.shape[:-1], self.action_size)
         g = self.reward(observations, none)
+        if self.h is None:
+            return g, g
         h = self.h(self.normaliser(observations))[..., 0]
         return g, g + (self.gamma - 1.0) * h

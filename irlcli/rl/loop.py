@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from irlcli.rl.challengers import Challengers
 from irlcli.rl.policy import Policy
 from irlcli.rl.ppo import RewardSource
 from irlcli.trajectories import Rollout, world_settings
@@ -54,9 +55,16 @@ class Learner(Protocol):
         """Called once, before the first round."""
 
     def update(
-        self, index: int, rollouts: Sequence[Rollout], policy: Policy
+        self,
+        index: int,
+        rollouts: Sequence[Rollout],
+        policy: Policy,
+        challenge: Sequence[Rollout],
     ) -> list[dict[str, float]]:
-        """Learn from the rollouts of round ``index``; diagnostics, one dict per setting."""
+        """Learn from the rollouts of round ``index``; diagnostics, one dict per setting.
+
+        ``challenge`` are the rollouts of a challenger, if there is one.
+        """
 
     def state_dict(self) -> State:
         """What a resumed run needs."""
@@ -91,7 +99,11 @@ class NoLearner:
         """Change nothing."""
 
     def update(
-        self, index: int, rollouts: Sequence[Rollout], policy: Policy
+        self,
+        index: int,
+        rollouts: Sequence[Rollout],
+        policy: Policy,
+        challenge: Sequence[Rollout],
     ) -> list[dict[str, float]]:
         """Learn nothing."""
         return [{} for _ in range(self._settings)]
@@ -131,6 +143,7 @@ class Training:
         learner: learns from every round's rollouts.
         selector: chooses the round that is kept.
         settings: of the worlds, in their order.
+        challengers: whose rollouts the learner learns from, too.
     """
 
     def __init__(
@@ -140,12 +153,14 @@ class Training:
         learner: Learner,
         selector: Selector,
         settings: Sequence[str],
+        challengers: Challengers | None = None,
     ):
         self.trainer = trainer
         self.source = source
         self.learner = learner
         self.selector = selector
         self.settings = list(settings)
+        self.challengers = challengers
         self.rounds_done = 0
         self.rows: list[Row] = []
 
@@ -159,7 +174,8 @@ class Training:
             self.learner.begin(self.trainer)
         for index in range(self.rounds_done, self.trainer.rounds):
             rollouts = self.trainer.train_round(index, self.source)
-            diagnostics = self.learner.update(index, rollouts, self.trainer.policy)
+            challenge = [] if self.challengers is None else self.challengers.train_round(index)
+            diagnostics = self.learner.update(index, rollouts, self.trainer.policy, challenge)
             score = self.selector.consider(index, self.trainer.policy)
             rows = [
                 row | of_setting | score
@@ -193,6 +209,7 @@ class Training:
             "trainer": self.trainer.state_dict(),
             "learner": self.learner.state_dict(),
             "selector": self.selector.state_dict(),
+            **({} if self.challengers is None else {"challengers": self.challengers.state_dict()}),
             "rounds_done": self.rounds_done,
         }
 
@@ -201,6 +218,8 @@ class Training:
         self.trainer.load_state_dict(state["trainer"])
         self.learner.load_state_dict(state["learner"])
         self.selector.load_state_dict(state["selector"])
+        if self.challengers is not None:
+            self.challengers.load_state_dict(state["challengers"])
         self.rounds_done = int(state["rounds_done"])
         self.rows = list(rows)
 

@@ -132,6 +132,7 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_metrics, write_policy, write_reward
     from irlcli.learners import learner as learner_class
     from irlcli.learners.selection import BestRound, hold_out, log_likelihood
+    from irlcli.rl.challengers import Challengers
     from irlcli.rl.loop import LastRound, Training
     from irlcli.rl.ppo import PPOTrainer, rounds
     from irlcli.rl.rollout import roll_out
@@ -169,6 +170,7 @@ def run(job: Job) -> None:
                 episodes,
                 airl,
                 worlds=len(worlds),
+                rounds=trainer.rounds,
                 horizon=p.environment.max_episode_steps,
                 observation_size=observation_size(worlds.observation_space),
                 actions=action_space(worlds.action_space),
@@ -191,7 +193,10 @@ def run(job: Job) -> None:
             score = likelihood if airl.select == "episodes" else true_return
             total = rounds(airl.ppo, airl.total_steps)
             selector = BestRound(score, learner, airl.select_every, total)
-        training = Training(trainer, learner, learner, selector, settings)
+        challengers = None
+        if airl.challenger.life > 0:
+            challengers = Challengers(worlds, airl.challenger, learner, p.seed, STAGE.name)
+        training = Training(trainer, learner, learner, selector, settings, challengers)
         rows = run_training(job, training)
     selected = None
     if isinstance(selector, BestRound):

@@ -42,6 +42,7 @@ def make(
         demos,
         config,
         worlds=len(worlds),
+        rounds=trainer.rounds,
         horizon=horizon,
         observation_size=worlds.observation_space.shape[0],
         actions=action_space(worlds.action_space),

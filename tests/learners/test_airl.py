@@ -10,7 +10,7 @@ import torch
 
 from irlcli.configs import AIRLConfig
 from irlcli.envs.lunar_lander.env import LunarLander
-from irlcli.learners import airl
+from irlcli.learners import airl, discriminator, pay
 from irlcli.learners.actions import clipped_log_prob
 from irlcli.learners.pools import Pool, Stratum, join_pools, make_pool, sample_minibatch
 from irlcli.learners.reward_model import RewardModel
@@ -81,7 +81,7 @@ def test_variable_horizon_reward_forms():
     f = model(*as_tensors(model, data))
     g = model.reward(*as_tensors(model, data)[:2])
     for form, expected in {"f": f, "g": g, "f-log-pi": f - log_probs}.items():
-        reward = airl.policy_reward(model, data, log_probs, form, False, GAMMA)
+        reward = pay.policy_reward(model, data, log_probs, form, False, GAMMA)
         torch.testing.assert_close(reward, expected)
         assert not reward.requires_grad
 
@@ -111,7 +111,7 @@ def test_absorbing_value_equals_stepping_the_environment(form):
         np.array([horizon - crash - 1]),
     )
     log_probs = torch.tensor([-1.2])
-    closed = airl.policy_reward(model, data, log_probs, form, True, GAMMA).item()
+    closed = pay.policy_reward(model, data, log_probs, form, True, GAMMA).item()
 
     s = torch.as_tensor(stacked[crash:])
     actions = torch.zeros(len(s) - 1, 4)
@@ -134,7 +134,7 @@ def test_an_episodes_reward_is_the_sum_over_its_horizon(absorbing):
     if absorbing:
         # No action is an action vector of zeros.
         steps += [float(model.reward(s_next[5:], torch.zeros(1, 4)))] * 7
-    assert airl.episode_reward(model, data, absorbing) == pytest.approx(sum(steps), rel=1e-5)
+    assert pay.episode_reward(model, data, absorbing) == pytest.approx(sum(steps), rel=1e-5)
 
 
 def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
@@ -214,8 +214,8 @@ def test_total_loss_is_the_papers_divided_by_lambda(weight):
     logit, f = torch.randn(2, 2, 6), torch.randn(2, 2, 6)
     weights = torch.tensor([0.25, 0.75])
     options = PenaltyOptions("reward", unbiased=False)
-    loss = airl.discriminator_loss(logit, f, weights, False, "irmv1", weight, options)
-    risks = airl.cross_entropy(logit)
+    loss = discriminator.discriminator_loss(logit, f, weights, False, "irmv1", weight, options)
+    risks = discriminator.cross_entropy(logit)
     assert loss.cross_entropy.item() == pytest.approx((0.25 * risks[0] + 0.75 * risks[1]).item())
     expected = loss.cross_entropy + weight * loss.penalty
     torch.testing.assert_close(loss.total, expected / max(1.0, weight))
@@ -226,8 +226,10 @@ def test_a_penalty_sees_balanced_settings_as_one_risk():
     logit, options = torch.randn(3, 2, 6), PenaltyOptions(unbiased=False)
     weights = torch.full((3,), 1 / 3)
     merged = torch.stack([logit[:, label].flatten() for label in (0, 1)])[None]
-    balanced = airl.discriminator_loss(logit, logit, weights, True, "irmv1", 1.0, options)
-    one = airl.discriminator_loss(merged, merged, torch.ones(1), False, "irmv1", 1.0, options)
+    balanced = discriminator.discriminator_loss(logit, logit, weights, True, "irmv1", 1.0, options)
+    one = discriminator.discriminator_loss(
+        merged, merged, torch.ones(1), False, "irmv1", 1.0, options
+    )
     torch.testing.assert_close(balanced.penalty, one.penalty)
     torch.testing.assert_close(balanced.total, one.total)
 
@@ -243,7 +245,7 @@ def test_weight_decay_does_not_depend_on_lambda(weight):
         weight_decay=0.5,
         hidden=(4,),
     )
-    learner = airl.AIRL([[EPISODE]], config, 1, 9, 8, ActionSpace(True, 4, None, None), 0)
+    learner = airl.AIRL([[EPISODE]], config, 1, 1, 9, 8, ActionSpace(True, 4, None, None), 0)
     before = {name: p.clone() for name, p in learner.model.named_parameters()}
     loss = sum(0.0 * p.sum() for p in learner.model.parameters()) / max(1.0, weight)
     loss.backward()
@@ -253,9 +255,9 @@ def test_weight_decay_does_not_depend_on_lambda(weight):
 
 
 def test_penalty_weight_schedule():
-    weights = [airl.penalty_weight_at(r, 8.0, warmup=2, ramp=4) for r in range(8)]
+    weights = [discriminator.penalty_weight_at(r, 8.0, warmup=2, ramp=4) for r in range(8)]
     assert weights == [0.0, 0.0, 2.0, 4.0, 6.0, 8.0, 8.0, 8.0]
-    assert airl.penalty_weight_at(0, 8.0, warmup=0, ramp=0) == 8.0
+    assert discriminator.penalty_weight_at(0, 8.0, warmup=0, ramp=0) == 8.0
 
 
 def test_trained_discriminator_is_the_density_ratio():
@@ -279,8 +281,8 @@ def test_trained_discriminator_is_the_density_ratio():
     generator = torch.Generator().manual_seed(0)
     for _ in range(600):
         batch = sample_minibatch([[Stratum(policy, expert, (), 256)]], generator)
-        logits, f = airl.discriminator_logits(model, batch)
-        loss = airl.discriminator_loss(
+        logits, f = discriminator.discriminator_logits(model, batch)
+        loss = discriminator.discriminator_loss(
             logits, f, torch.ones(1), False, "none", 0.0, PenaltyOptions()
         )
         optimizer.zero_grad()
@@ -299,7 +301,7 @@ def test_reward_scale_is_the_deviation_over_draws():
     with torch.no_grad():
         g = model.reward(pool.observations, pool.actions).numpy().astype(float)
     repeated = np.concatenate([g[:12], np.repeat(g[12:], 7)])
-    assert airl.reward_scale(model, [pool]) == pytest.approx(repeated.std(ddof=1))
+    assert pay.reward_scale(model, [pool]) == pytest.approx(repeated.std(ddof=1))
 
 
 def test_normaliser_moments_do_not_depend_on_the_batching():

@@ -18,8 +18,8 @@ from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import parse_setting
-from irlcli.learners.airl import reward_quantiles
-from irlcli.learners.frozen import FrozenReward, bounded_pay
+from irlcli.learners.frozen import FrozenReward
+from irlcli.learners.pay import bounded_pay, reward_quantiles
 from irlcli.learners.pools import make_pool
 from irlcli.learners.reward_model import RewardModel
 from irlcli.rl.rollout import roll_out
@@ -156,6 +156,7 @@ def continuous(path, actions, numbers=None):
         hidden=(),
         activation="tanh",
         gamma=0.9,
+        shaping=True,
     )
     settings = AIRLConfig(actions=actions, fixed_horizon=False)
     about = descriptions.Reward(

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from irlcli.learners.airl import cross_entropy
+from irlcli.learners.discriminator import cross_entropy
 from irlcli.penalties import PenaltyOptions, irmv1
 
 SHAPE = (3, 2, 8)

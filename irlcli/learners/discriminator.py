@@ -1,0 +1,110 @@
+"""The discriminator's loss: cross-entropies of risks, and an invariance penalty (paper Eq. 2 to 5).
+
+Samples are laid out [E, 2, B]: E risks, label 0 = policy and 1 = expert, B samples of each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch.nn.functional import softplus
+
+from irlcli.learners.pools import Minibatch
+from irlcli.learners.reward_model import RewardModel
+from irlcli.penalties import PenaltyOptions, discriminator_penalty
+
+
+def discriminator_logits(
+    model: RewardModel, batch: Minibatch, form: str = "f-log-pi"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(logits, f), each [E, 2, B]. The sigmoid of the logits is D.
+
+    ``form`` is ``f-log-pi`` (paper Eq. 2) or ``f`` (the discriminator of GAIL, Ho and Ermon 2016).
+    """
+    f = model(batch.observations, batch.actions, batch.next_observations, batch.terminated)
+    return (f if form == "f" else f - batch.log_probs), f
+
+
+def cross_entropy(logits: torch.Tensor) -> torch.Tensor:
+    """Binary cross-entropy [E] of ``logits`` [E, 2, B], labels weighted equally.
+
+    Paper Eq. 3 with its sign corrected: expert = 1, policy = 0, to be minimised.
+    """
+    return 0.5 * (softplus(logits[:, 0]).mean(-1) + softplus(-logits[:, 1]).mean(-1))
+
+
+def gradient_penalty(model: RewardModel, batch: Minibatch, mix: torch.Tensor) -> torch.Tensor:
+    """Mean squared gradient of g by its input, on lines between policy and expert samples.
+
+    Zero-centred (Mescheder et al. 2018), at the points of Gulrajani et al. (2017). It bounds how
+    steep g gets, so that g still rises where a policy is far from the demonstrations.
+
+    Args:
+        batch: samples [E, 2, B].
+        mix: share of the expert's sample in each point [E, B, 1], in [0, 1].
+    """
+    x = model.inputs(batch.observations, batch.actions)
+    points = (mix * x[:, 1] + (1.0 - mix) * x[:, 0]).detach().requires_grad_()
+    (gradient,) = torch.autograd.grad(model.g(points).sum(), points, create_graph=True)
+    return gradient.square().sum(-1).mean()
+
+
+class Loss(NamedTuple):
+    """A minibatch's loss and what it consists of, all scalar tensors."""
+
+    total: torch.Tensor
+    cross_entropy: torch.Tensor
+    penalty: torch.Tensor
+
+
+def discriminator_loss(
+    logits: torch.Tensor,
+    f: torch.Tensor,
+    weights: torch.Tensor,
+    one_risk: bool,
+    penalty: str,
+    penalty_weight: float,
+    options: PenaltyOptions,
+    share: float = 1.0,
+    beside: torch.Tensor | float = 0.0,
+) -> Loss:
+    """(share sum_e w_e BCE_e + beside + lambda penalty) / max(1, lambda) (paper Eq. 5, Algorithm 1).
+
+    The paper sums over settings where this averages. Dividing by lambda keeps the gradient's size
+    when the penalty dominates. Challengers are not part of the penalty: they are told from experts
+    so easily that it would be small for any reward.
+
+    Args:
+        logits: f - log pi [E, 2, B].
+        f: the learned part [E, 2, B].
+        weights: w [E], in sum one.
+        one_risk: whether the penalty sees all E as one risk (``balanced``).
+        penalty: a key of ``irlcli.penalties.PENALTIES``.
+        penalty_weight: lambda, at least 0.
+        options: how the penalty is estimated.
+        share: of this cross-entropy in the loss; the challengers' has the rest.
+        beside: what else is minimised, a scalar.
+    """
+    risks = cross_entropy(logits)
+    risk = (weights * risks).sum()
+    seen = (logits, f, risks)
+    if one_risk:
+        seen = (_merged(logits), _merged(f), risk[None])
+    penalised = discriminator_penalty(penalty)(*seen, options)
+    total = share * risk + beside
+    if penalty_weight > 0.0:
+        total = (total + penalty_weight * penalised) / max(1.0, penalty_weight)
+    return Loss(total, risk.detach(), penalised.detach())
+
+
+def _merged(samples: torch.Tensor) -> torch.Tensor:
+    """[E, 2, B] as one risk [1, 2, E * B]."""
+    return samples.transpose(0, 1).reshape(1, 2, -1)
+
+
+def penalty_weight_at(index: int, weight: float, warmup: int, ramp: int) -> float:
+    """lambda of round ``index``: 0 for ``warmup`` rounds, then linear over ``ramp`` to ``weight``."""
+    if index < warmup:
+        return 0.0
+    return weight * min(1.0, (index - warmup + 1) / max(1, ramp))

@@ -1,0 +1,105 @@
+"""What a reward model pays: step by step to a policy in training, and to a whole episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from irlcli.learners.pools import Pool, make_pool
+from irlcli.learners.reward_model import RewardModel
+from irlcli.trajectories import Transitions
+
+
+def policy_reward(
+    model: RewardModel,
+    data: Transitions,
+    log_probs: torch.Tensor,
+    form: str,
+    absorbing: bool,
+    gamma: float,
+) -> torch.Tensor:
+    """The reward of each transition [B] float32, without gradient.
+
+    ``form`` is ``f-log-pi`` (log D - log(1 - D), Algorithm 1), ``f`` or ``g``. With ``absorbing``,
+    a terminated transition also earns the discounted sum of its absorbing state's rewards for a
+    policy that discounts by ``gamma``: gamma / (1 - gamma) times the reward there, where log pi is
+    zero.
+    """
+    with torch.no_grad():
+        observations = torch.as_tensor(data.observations)
+        actions = model.encode(torch.as_tensor(data.actions))
+        successors = torch.as_tensor(data.next_observations)
+        terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
+        if form == "g":
+            reward = model.reward(observations, actions)
+        else:
+            ends = torch.zeros_like(terminated) if absorbing else terminated
+            reward = model(observations, actions, successors, ends)
+        if form == "f-log-pi":
+            reward = reward - log_probs
+        if absorbing and bool(terminated.any()):
+            g, f = model.absorbing_reward(successors)
+            series = gamma / (1.0 - gamma)
+            reward = reward + terminated * series * (g if form == "g" else f)
+        return reward
+
+
+def bounded_pay(
+    model: RewardModel, data: Transitions, ceiling: float, absorbing: bool, gamma: float
+) -> torch.Tensor:
+    """min(g, ``ceiling``) of each transition [B] float32, without gradient.
+
+    With ``absorbing``, a terminated transition also earns the discounted sum of its absorbing
+    state's rewards, gamma / (1 - gamma) times the bounded reward there.
+    """
+    with torch.no_grad():
+        actions = model.encode(torch.as_tensor(data.actions))
+        pay = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
+        terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
+        if absorbing and bool(terminated.any()):
+            g, _ = model.absorbing_reward(torch.as_tensor(data.next_observations))
+            pay = pay + terminated * gamma / (1.0 - gamma) * g.clamp(max=ceiling)
+        return pay
+
+
+def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
+    """Standard deviation of g over the samples of ``pools``, each row as often as drawn.
+
+    Fixed on training data, it makes frozen rewards of different runs comparable. Nothing is
+    centred, which would change what the reward asks for.
+    """
+    with torch.no_grad():
+        g = torch.cat([model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools])
+    return max(float(g.double().std()), 1e-6)
+
+
+def reward_quantiles(model: RewardModel, demonstrations: Sequence[Pool]) -> tuple[float, ...]:
+    """The 0, 1, ... 100 % quantiles of g over the settings' pools of ``demonstrations``.
+
+    Each row counts as often as drawn; all settings weigh the same.
+    """
+    with torch.no_grad():
+        g = [model.reward(pool.observations, pool.actions)[pool.draw] for pool in demonstrations]
+    weights = np.concatenate([np.full(len(values), 1.0 / len(values)) for values in g])
+    found = np.quantile(
+        torch.cat(g).double().numpy(),
+        np.linspace(0.0, 1.0, 101),
+        weights=weights,
+        method="inverted_cdf",
+    )
+    return tuple(float(value) for value in found)
+
+
+def level_of(quantiles: Sequence[float], share: float) -> float:
+    """The reward that a ``share`` of the demonstrations' steps does not exceed."""
+    return float(np.interp(100.0 * share, range(101), quantiles))
+
+
+def episode_reward(model: RewardModel, data: Transitions, absorbing: bool) -> float:
+    """Undiscounted sum of g over ``data``; with ``absorbing``, up to the horizon."""
+    with torch.no_grad():
+        pool = make_pool(model, data, torch.zeros(len(data)), absorbing)
+        g = model.reward(pool.observations, pool.actions)
+    return float(g.double()[pool.draw].sum())
