@@ -21,7 +21,7 @@ from irlcli import stages
 from irlcli.configs import Config, InterventionConfig
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.experiments.bank import Policies, bank
+from irlcli.experiments.bank import Policies, Retrained, bank
 from irlcli.interventions import parse_settings
 from irlcli.learners import LEARNERS
 from irlcli.penalties import PENALTIES
@@ -142,7 +142,9 @@ def assessed(config: Config, seed: int = 0) -> Request:
         student=From(airl(config), "policy.pt"),
         reused={str(SETTINGS[0]): From(expert(config), "policy.pt")},
         experts={},
-        retrained={str(UNSEEN): {"retrained": From(retrained(config), "policy.pt")}},
+        retrained={
+            str(UNSEEN): [Retrained("retrained", From(retrained(config), "policy.pt"), None)]
+        },
     )
     reward = From(airl(config), "reward.pt")
     return assess.request(reward, ENV, bank(ENV, [UNSEEN], config, policies, seed))

@@ -1,5 +1,6 @@
 """The robots through the real command line: workers, progress, goals, pictures, bad input."""
 
+import json
 import shutil
 
 import numpy as np
@@ -39,6 +40,18 @@ def test_progress_stands_beside_the_return(chains, irl):
     done = irl("report", "returns", "score", "--store", chains / "1")
     assert done.code == 0 and "progress" in done.out.splitlines()[0]
     assert "reacher gravity=4x" in done.out
+
+
+def test_a_robots_reward_is_assessed(chains, irl, tmp_path):
+    store = tmp_path / "runs"
+    shutil.copytree(chains / "1", store, symlinks=True)
+    common = ["--store", store, "--profile", "smoke", "--quiet"]
+    done = irl("assess", "airl", "--ood", "gravity", *common, "--json")
+    assert done.code == 0, done.err
+    bank = json.loads(done.out)["assessment"]["bank"]
+    kinds = {"idle", "random", "clone", "student", "reused", "retrained"}
+    assert {e["kind"] for e in bank} == kinds and len(bank) == 11
+    assert all(e["progress"] is not None for e in bank)
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def assess(
         settings = arguments.named_settings(env, config, intervention, "id", origin)
     else:
         settings = [parse_setting(env, text) for text in origin.settings]
-    finder = bank.Finder(session.store.index(), session.runner().lookup(), config)
+    finder = bank.Finder(session.store, session.runner().lookup(), config)
     shown, cloned = finder.demonstrations(source), origin.settings
     if demos is not None:
         shown, cloned = _given(session, demos, env)
@@ -118,12 +118,20 @@ def _print(assessment: Assessment) -> None:
             _measured(r.true_regret),
             _measured(r.learned_gap),
             r.verdict + ("" if r.clear else " (within two standard errors)"),
+            "-" if r.ceiling is None else f"{r.ceiling:g}",
         ]
         for s in assessment.settings
         for r in s.retrained
     ]
     if splits:
-        columns = ["setting", "retrained policy", "true regret", "learned gap", "verdict"]
+        columns = [
+            "setting",
+            "retrained policy",
+            "true regret",
+            "learned gap",
+            "verdict",
+            "ceiling",
+        ]
         out.print_table(columns, splits, stderr=True)
 
 

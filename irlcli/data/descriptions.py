@@ -206,7 +206,9 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
 
     Attributes:
         true_regret: true return of the expert minus the policy's.
-        learned_gap: learned return of the expert minus the policy's.
+        learned_gap: learned return of the expert minus the policy's, both under ``ceiling``.
+        ceiling: of the rewards that the policy was trained on, as a quantile of g on the
+            demonstrations; None without.
         clear: whether the difference that decides the verdict exceeds two standard errors.
     """
 
@@ -215,6 +217,7 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
     learned_gap: Measured
     verdict: Verdict
     clear: bool
+    ceiling: Finite | None = None
 
 
 class BankEntry(Struct, frozen=True, kw_only=True):

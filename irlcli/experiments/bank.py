@@ -10,12 +10,22 @@ from typing import NamedTuple
 
 from irlcli.configs import Config
 from irlcli.data.descriptions import Reward
+from irlcli.errors import NotFound
+from irlcli.experiments.references import student_beside, tensor_file
 from irlcli.experiments.status import Lookup, source_in
 from irlcli.interventions import Setting, parse_setting
 from irlcli.stages import clone, record, train_expert
 from irlcli.stages.assess import Entry
 from irlcli.stages.base import From, Request, Source
-from irlcli.store import Artefact, Index
+from irlcli.store import Artefact, Store
+
+
+class Retrained(NamedTuple):
+    """A policy that was retrained on the reward, and the ceiling of the rewards it was paid."""
+
+    name: str
+    policy: Source | From
+    ceiling: float | None
 
 
 class Policies(NamedTuple):
@@ -26,14 +36,14 @@ class Policies(NamedTuple):
         student: trained together with the reward.
         reused: experts of other settings, by the setting each was trained in.
         experts: each setting's own, by setting.
-        retrained: by the setting of the training, then by name.
+        retrained: by the setting of the training.
     """
 
     clone: Source | From | None
     student: Source | From | None
     reused: Mapping[str, Source | From]
     experts: Mapping[str, Source | From]
-    retrained: Mapping[str, Mapping[str, Source | From]]
+    retrained: Mapping[str, Sequence[Retrained]]
 
 
 def bank(
@@ -42,52 +52,60 @@ def bank(
     """The entries of a bank in ``settings``, each with the request that records its episodes."""
     found: dict[Entry, Request] = {}
     for place in settings:
-        for name, kind, policy, noise in _members(str(place), config, policies):
-            entry = Entry(policy=name, kind=kind, setting=str(place))
+        for member in _members(str(place), config, policies):
+            entry = Entry(
+                policy=member.name, kind=member.kind, setting=str(place), ceiling=member.ceiling
+            )
             found[entry] = record.request(
                 env,
                 place,
                 config.evaluation,
-                policy,
-                agent=kind if kind in ("idle", "random") else "policy",  # type: ignore[arg-type]
-                noise=noise,
+                member.policy,
+                agent="policy" if member.policy is not None else member.kind,  # type: ignore[arg-type]
+                noise=member.noise,
                 seed=seed,
-                policy_label="" if policy is None else kind if noise else name,
+                policy_label=member.kind if member.noise else member.name,
             )
     return found
 
 
-def _members(
-    place: str, config: Config, policies: Policies
-) -> Iterator[tuple[str, str, Source | From | None, float]]:
-    """Name, kind, policy and noise of each member in ``place``."""
-    yield "idle", "idle", None, 0.0
-    yield "random", "random", None, 0.0
+class _Member(NamedTuple):
+    name: str
+    kind: str
+    policy: Source | From | None = None
+    noise: float = 0.0
+    ceiling: float | None = None
+
+
+def _members(place: str, config: Config, policies: Policies) -> Iterator[_Member]:
+    yield _Member("idle", "idle")
+    yield _Member("random", "random")
     if policies.clone is not None:
         for noise in dict.fromkeys(config.assessment.noise):
-            yield f"clone, noise {noise}", "clone", policies.clone, noise
+            yield _Member(f"clone, noise {noise}", "clone", policies.clone, noise)
     if policies.student is not None:
-        yield "student", "student", policies.student, 0.0
+        yield _Member("student", "student", policies.student)
     for trained, expert in policies.reused.items():
         if trained != place:
-            yield f"expert of {trained}", "reused", expert, 0.0
+            yield _Member(f"expert of {trained}", "reused", expert)
     if place in policies.experts:
-        yield f"expert of {place}", "expert", policies.experts[place], 0.0
-    for name, policy in policies.retrained.get(place, {}).items():
-        yield name, "retrained", policy, 0.0
+        yield _Member(f"expert of {place}", "expert", policies.experts[place])
+    for name, policy, ceiling in policies.retrained.get(place, ()):
+        yield _Member(name, "retrained", policy, ceiling=ceiling)
 
 
 class Finder:
     """Looks for the policies of a bank in a store.
 
     Args:
-        index: of the store.
+        store: the store.
         lookup: of the store and of those to copy from.
         config: under which experts are looked up.
     """
 
-    def __init__(self, index: Index, lookup: Lookup, config: Config):
-        self._index = index
+    def __init__(self, store: Store, lookup: Lookup, config: Config):
+        self._store = store
+        self._index = store.index()
         self._lookup = lookup
         self._config = config
 
@@ -115,8 +133,7 @@ class Finder:
             cloned: their settings that the clone imitates.
             seed: of the clone.
         """
-        env, maker = origin.env, self._maker(reward)
-        imitation = None
+        env, imitation = origin.env, None
         if demos is not None:
             places = [parse_setting(env, text) for text in cloned]
             request = clone.request(demos, env, places, self._config, seed)
@@ -129,7 +146,7 @@ class Finder:
                 experts[text] = expert
         return Policies(
             clone=imitation,
-            student=None if maker is None else source_in(maker, "policy.pt"),
+            student=self._student(reward, origin),
             reused={text: experts[text] for text in origin.settings if text in experts},
             experts=experts,
             retrained={str(s): self._retrained(reward, str(s)) for s in settings},
@@ -156,8 +173,22 @@ class Finder:
         request = train_expert.request(env, place, 0, self._config.expert_of(place))
         return From(request, "policy.pt") if self._lookup(request).artefact is not None else None
 
-    def _retrained(self, reward: Source, place: str) -> dict[str, Source]:
-        found = {}
+    def _student(self, reward: Source, origin: Reward) -> Source | None:
+        maker = self._maker(reward)
+        if maker is not None:
+            return source_in(maker, "policy.pt")
+        try:
+            beside = student_beside(reward)
+        except NotFound:
+            return None
+        # A folder may hold anything under that name.
+        student, about = tensor_file(self._store, str(beside.path), "policy")
+        own = about.agent, about.env, about.method, about.seed, about.settings
+        of = "student", origin.env, origin.method, origin.seed, origin.settings
+        return student if own == of else None
+
+    def _retrained(self, reward: Source, place: str) -> list[Retrained]:
+        found = []
         for artefact in self._index.artefacts.values():
             record_ = artefact.manifest.record
             if (
@@ -165,5 +196,10 @@ class Finder:
                 and record_.inputs.get("reward") == reward.sha256
                 and record_.parameters.get("setting") == place
             ):
-                found[f"retrained {artefact.id[:8]}"] = source_in(artefact, "policy.pt")
-        return dict(sorted(found.items()))
+                config = record_.parameters["transfer"]
+                words = ["retrained", artefact.id[:8]]
+                words += ["from the student"] if "start" in record_.inputs else []
+                words += [f"by {config['algorithm']}"] if config["algorithm"] != "ppo" else []
+                policy = source_in(artefact, "policy.pt")
+                found.append(Retrained(" ".join(words), policy, config.get("ceiling")))
+        return sorted(found)

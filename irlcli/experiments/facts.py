@@ -9,6 +9,8 @@ from irlcli.report.parameters import Code, Others, Run
 from irlcli.store import Artefact, KeyRecord, digest
 
 _Subject = tuple[Any, ...]
+# With other inputs, an artefact of these stages is about something else.
+_BY_INPUTS = ("transfer", "evaluate", "record", "assess")
 
 
 def runs(
@@ -78,10 +80,11 @@ def _subject(record: KeyRecord) -> _Subject:
         tuple(places) if isinstance(places, list | tuple) else places,
         _method(parameters),
         parameters.get("agent"),
+        parameters.get("noise"),
         # The seed of an evaluation is a parameter like another. Those of other stages tell
         # repetitions apart.
         parameters.get("seed") if record.stage != "evaluate" else None,
-        tuple(sorted(record.inputs.values())) if record.stage in ("transfer", "evaluate") else None,
+        tuple(sorted(record.inputs.values())) if record.stage in _BY_INPUTS else None,
     )
 
 

@@ -15,7 +15,7 @@ from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import Task, made_by
 from irlcli.experiments.status import source_in
 from irlcli.interventions import parse_settings
-from irlcli.report.parameters import Cell, Row
+from irlcli.report.parameters import ASSESS, Cell, Row
 from irlcli.stages import report, report_experts
 from irlcli.stages.base import Request, Source
 from irlcli.store import Artefact
@@ -50,7 +50,7 @@ def request(plan: Plan, command: str) -> Request:
         kind=plan.table.name,
         title=plan.table.title,
         command=command,
-        measures=plan.table.measures,
+        measures=tuple(m for m in plan.table.measures if m != ASSESS),
         rows=tuple(_rows(plan)),
         methods=plan.table.methods,
         seeds=plan.table.seeds,

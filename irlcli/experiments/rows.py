@@ -8,8 +8,10 @@ A task's name is that of its row and what it makes::
     ROW.expert.VALUE.reused-returns  ....reused-id-returns       in the unseen one, in all trained
     ROW.METHOD.SEED.zero-shot-returns  ....id-returns  ....transfer-returns  ....expert-by-reward
     ROW.METHOD.SEED.choice                                       lambda, with --choose-penalty
+    ROW.clone  ROW.bank.POLICY.VALUE  ROW.METHOD.SEED.bank.POLICY.VALUE  ROW.METHOD.SEED.assess
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -17,13 +19,16 @@ import msgspec
 
 from irlcli.configs import Config
 from irlcli.errors import UsageError
+from irlcli.experiments.bank import Policies, Retrained, bank
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
 from irlcli.interventions import Setting, parse_settings
 from irlcli.methods import fields
-from irlcli.report.parameters import EXPERT_BY_REWARD, Cell
+from irlcli.report.parameters import ASSESS, EXPERT_BY_REWARD, Cell
 from irlcli.stages import (
+    assess,
     choose_penalty,
+    clone,
     collect_experts,
     evaluate,
     figure2,
@@ -219,6 +224,7 @@ def _run(
         cell = requests.cell(method_name, "id", seed)
         request = requests.returns(trained, learned, policy_label=student)
         yield Task(f"{name}.id-returns", "returns", request, cell)
+    moved = None
     if "transfer" in measures:
         moved = transfer.request(
             From(learned, "reward.pt"),
@@ -242,6 +248,45 @@ def _run(
             unseen, expert, reward=learned, policy_label=label, reward_label=learner
         )
         yield Task(f"{name}.expert-by-reward", "returns", request, cell)
+    if ASSESS in measures:
+        yield from _assessment(requests, demos, learned, moved, method_name, seed)
+
+
+def _assessment(
+    requests: _RowRequests,
+    demos: Request,
+    learned: Request,
+    moved: Request | None,
+    method_name: str,
+    seed: int,
+) -> Iterator[Task]:
+    """The bank of a row's policies, and how well the reward of ``learned`` ranks them."""
+    row, trained, unseen = requests.row, requests.trained, requests.unseen
+    places = [*trained, *unseen]
+    imitation = clone.request(From(demos), row.env, trained, requests.config)
+    yield Task(f"{row}.clone", "returns", imitation)
+    experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}
+    retrained = []
+    if moved is not None:
+        ceiling = moved.parameters.transfer.ceiling
+        retrained = [Retrained("retrained", From(moved, "policy.pt"), ceiling)]
+    policies = Policies(
+        clone=From(imitation, "policy.pt"),
+        student=From(learned, "policy.pt"),
+        reused={str(e): experts[str(e)] for e in trained},
+        experts=experts,
+        retrained={str(unseen[0]): retrained},
+    )
+    members = bank(row.env, places, requests.config, policies)
+    for entry, recorded in members.items():
+        owner = f"{row}.{method_name}.{seed}" if entry.kind in ("student", "retrained") else row
+        policy = re.sub(r"[^A-Za-z0-9.]+", "-", entry.policy.replace(f"{row.knob}=", ""))
+        place = entry.setting.partition("=")[2].replace(":", "_")
+        yield Task(f"{owner}.bank.{policy}.{place}", "returns", recorded)
+    label = f"{train_airl.describe(learned.parameters.airl)} seed {seed}"
+    request = assess.request(From(learned, "reward.pt"), row.env, members, label)
+    cell = requests.cell(method_name, ASSESS, seed)
+    yield Task(f"{row}.{method_name}.{seed}.assess", "returns", request, cell)
 
 
 def _choice(name: str, choice: Request) -> Iterator[Task]:

@@ -14,7 +14,7 @@ from irlcli.interventions import knob_of
 from irlcli.methods import METHODS
 
 Kind = Literal["comparison", "experts", "figure2"]
-Measure = Literal["transfer", "zero-shot", "id"]
+Measure = Literal["transfer", "zero-shot", "id", "assess"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 _NAME = r"[a-z][a-z0-9-]{0,30}"
 _DEFAULTS = "defaults"
@@ -168,6 +168,11 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
     _check_list(f"{name}.rows", rows)
     _check_list(f"{name}.methods", filled["methods"], METHODS)
     _check_list(f"{name}.measures", filled["measures"], MEASURES)
+    if filled["measures"] == ["assess"]:
+        raise UsageError(
+            f"{name}.measures: assess alone fills no cell of a table",
+            "add transfer, zero-shot or id",
+        )
     for seed in filled["seeds"]:
         if type(seed) is not int or seed < 0:
             raise UsageError(f"{name}.seeds: {seed!r} is not a seed", "a whole number from 0")

@@ -27,7 +27,8 @@ class FrozenReward:
         observation_size: D of that setting.
         actions: its actions.
         ceiling: a step's reward is at most this quantile of g on the demonstrations; None: g has
-            no bound. Returns of episodes are never bounded: they measure the reward as learned.
+            no bound. Returns of episodes are not bounded by default: they measure the reward as
+            learned.
 
     Raises:
         UsageError: the reward takes other observations or actions, or has no quantiles for a
@@ -80,13 +81,14 @@ class FrozenReward:
         pay = bounded_pay(self._model, data, self._ceiling, self._absorbing, self._gamma)
         return (pay / self._scale).numpy().reshape(rollout.terminated.shape)
 
-    def of_episode(self, trajectory: Trajectory) -> float:
-        """The undiscounted learned return of a whole episode.
+    def of_episode(self, trajectory: Trajectory, bounded: bool = False) -> float:
+        """The undiscounted learned return of a whole episode; ``bounded`` by the ceiling if asked.
 
         Where absorbing states were learned, the final one counts up to the horizon.
         """
         data = self._view.of(transitions([trajectory], self._horizon))
-        return episode_reward(self._model, data, self._absorbing) / self._scale
+        ceiling = self._ceiling if bounded else math.inf
+        return episode_reward(self._model, data, self._absorbing, ceiling) / self._scale
 
 
 def _actions(described: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -97,9 +98,11 @@ def level_of(quantiles: Sequence[float], share: float) -> float:
     return float(np.interp(100.0 * share, range(101), quantiles))
 
 
-def episode_reward(model: RewardModel, data: Transitions, absorbing: bool) -> float:
-    """Undiscounted sum of g over ``data``; with ``absorbing``, up to the horizon."""
+def episode_reward(
+    model: RewardModel, data: Transitions, absorbing: bool, ceiling: float = math.inf
+) -> float:
+    """Undiscounted sum of min(g, ``ceiling``) over ``data``; with ``absorbing``, up to the horizon."""
     with torch.no_grad():
         pool = make_pool(model, data, torch.zeros(len(data)), absorbing)
         g = model.reward(pool.observations, pool.actions)
-    return float(g.double()[pool.draw].sum())
+    return float(g.double().clamp(max=ceiling)[pool.draw].sum())

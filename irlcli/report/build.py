@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
@@ -22,6 +23,7 @@ class Report:
         comparisons: see :func:`irlcli.report.compute.compare_methods`.
         learned_returns: see :func:`irlcli.report.compute.learned_returns`.
         discriminators: see :func:`irlcli.report.compute.discriminator_ends`.
+        reward_quality: see :func:`irlcli.report.compute.reward_quality`.
         tables: the same for people.
         caveats: what a reader must know before drawing conclusions.
     """
@@ -31,12 +33,17 @@ class Report:
     comparisons: pd.DataFrame
     learned_returns: pd.DataFrame
     discriminators: pd.DataFrame
+    reward_quality: pd.DataFrame
     tables: list[Table]
     caveats: list[str]
 
 
 def build(
-    p: Parameters, points: pd.DataFrame, episodes: caveats.Episodes, learning: compute.Learning
+    p: Parameters,
+    points: pd.DataFrame,
+    episodes: caveats.Episodes,
+    learning: compute.Learning,
+    assessments: compute.Assessments = MappingProxyType({}),
 ) -> Report:
     """The report on ``points``.
 
@@ -45,14 +52,17 @@ def build(
         points: a row per evaluation and setting, see :mod:`irlcli.report.compute`.
         episodes: the true returns by (row, measure), then (method, seed).
         learning: the metrics of ``train-airl`` by (row, method, seed).
+        assessments: of the rewards, by (row, method, seed).
     """
     cells = compute.summarise_cells(p, points)
     comparisons = compute.compare_methods(p, points, cells)
     learned_returns = compute.learned_returns(p, points)
     discriminators = compute.discriminator_ends(p, learning)
+    quality = compute.reward_quality(p, assessments)
     tables = [
         *result_tables.measures(p, cells, comparisons),
         result_tables.learned_returns(learned_returns),
+        result_tables.reward_quality(quality),
         result_tables.comparisons(p, comparisons),
         result_tables.discriminators(discriminators),
         result_tables.cells(cells),
@@ -71,7 +81,9 @@ def build(
         *caveats.mixed(p),
     ]
     tables = [table for table in tables if table.rows]
-    return Report(points, cells, comparisons, learned_returns, discriminators, tables, found)
+    return Report(
+        points, cells, comparisons, learned_returns, discriminators, quality, tables, found
+    )
 
 
 def as_json(report: Report) -> dict[str, Any]:
@@ -86,6 +98,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "comparisons": records(report.comparisons),
         "learned_returns": records(report.learned_returns),
         "discriminators": records(report.discriminators),
+        "reward_quality": records(report.reward_quality),
         "points": records(report.points),
         "tables": [table._asdict() for table in report.tables],
         "caveats": report.caveats,

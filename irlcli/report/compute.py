@@ -22,7 +22,7 @@ from typing import Any
 
 import pandas as pd
 
-from irlcli.data.descriptions import Measured, Verdict
+from irlcli.data.descriptions import Assessment, Interval, Measured, Verdict
 from irlcli.report.agents import BASELINES, comparisons
 from irlcli.report.lineage import evaluations, is_mixed, origins
 from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
@@ -42,6 +42,7 @@ _DIAGNOSTICS = (
 )
 
 Learning = Mapping[tuple[str, str, int], pd.DataFrame]
+Assessments = Mapping[tuple[str, str, int | None], Assessment]
 
 
 def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
@@ -200,6 +201,39 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             counts = len(both) - verdicts.count("retrained"), verdicts.count("wrong reward")
             found.append((row.name, method, len(both), *means, *counts))
     return pd.DataFrame(found, columns=columns)
+
+
+def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
+    """How well each reward ranks a bank of policies, a row per row, method, setting and seed.
+
+    Columns: ``row``, ``agent``, ``setting``, ``seed``; ``spearman`` and ``spearman_low`` over the
+    bank and over its lower half; ``expert_minus_idle`` per step; ``return_distance``; ``verdict``
+    on the policy retrained there, missing without one.
+    """
+
+    def value(found: Interval | None) -> float | None:
+        return None if found is None else found.value
+
+    found = [
+        {
+            "row": row.name,
+            "agent": method,
+            "setting": s.setting,
+            "seed": seed,
+            "spearman": value(s.overall.spearman),
+            "spearman_low": value(s.lower_half.spearman),
+            "expert_minus_idle": s.expert_minus_idle and s.expert_minus_idle.mean,
+            "return_distance": s.return_distance,
+            "verdict": s.retrained[0].verdict if s.retrained else None,
+        }
+        for row in p.rows
+        for method in p.methods
+        for seed in p.seeds
+        if (row.name, method, seed) in assessments
+        for s in assessments[row.name, method, seed].settings
+    ]
+    columns = ["row", "agent", "setting", "seed", "spearman", "spearman_low", "expert_minus_idle"]
+    return pd.DataFrame(found, columns=[*columns, "return_distance", "verdict"])
 
 
 def _verdict(seed: Any, random: float) -> Verdict:

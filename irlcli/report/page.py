@@ -30,6 +30,9 @@ def markdown(p: Parameters, report: Report) -> str:
         parts.append("".join(f"- {caveat}\n" for caveat in report.caveats))
     for table in report.tables:
         parts += [f"## {table.title}\n", markdown_table(table.columns, table.rows)]
+        if table.title == "Reward quality":
+            rows = dict.fromkeys(report.reward_quality["row"])
+            parts += [f"![{row}](bank-{row.replace(' ', '-')}.png)\n" for row in rows]
         parts += [table.note + "\n"] if table.note else []
     parts.append("## Files\n")
     parts.append(
@@ -79,12 +82,18 @@ pre { font-size: .82rem; overflow-x: auto; } summary { cursor: pointer; padding:
 """
 
 
-def html(p: Parameters, report: Report, points: str, curves: Mapping[str, str]) -> str:
+def html(
+    p: Parameters,
+    report: Report,
+    points: str,
+    banks: Mapping[str, str],
+    curves: Mapping[str, str],
+) -> str:
     """One self-contained page.
 
     Args:
         points: SVG of every seed's point.
-        curves: SVGs by title.
+        banks, curves: SVGs by title.
     """
     sections = [
         (
@@ -96,6 +105,11 @@ def html(p: Parameters, report: Report, points: str, curves: Mapping[str, str]) 
         *((t.title, _html_table(t)) for t in report.tables[: len(p.measures)]),
         ("Every seed", _figure("Every seed, the mean and its 95 % bootstrap interval.", points)),
         *((t.title, _html_table(t)) for t in report.tables[len(p.measures) :]),
+        *(
+            [("Learned against true return", "".join(_figure(t, svg) for t, svg in banks.items()))]
+            if banks
+            else []
+        ),
         ("Every seed in numbers", _html_table(_seeds(report))),
         (
             "Learning curves",

@@ -10,6 +10,8 @@ import msgspec
 
 # The measure of cells in which the held-out setting's expert is scored by a learned reward.
 EXPERT_BY_REWARD = "expert by reward"
+# The measure of cells that hold no returns but the assessment of a learned reward.
+ASSESS = "assess"
 
 
 class Cell(msgspec.Struct, frozen=True):
@@ -20,8 +22,9 @@ class Cell(msgspec.Struct, frozen=True):
         agent: a method, ``expert``, ``random``, ``idle``, or ``reused``: the expert of a training
             setting, evaluated in the settings in which the students are evaluated.
         measure: ``transfer`` (the retrained policy), ``zero-shot`` or ``id`` (the student, in the
-            held-out setting or in distribution), ``ood`` for an agent without a reward, or
-            ``expert by reward``: the held-out setting's expert, scored by this seed's reward.
+            held-out setting or in distribution), ``ood`` for an agent without a reward,
+            ``expert by reward``: the held-out setting's expert, scored by this seed's reward, or
+            ``assess``: the reward itself, measured on a bank of policies.
         seed: of the reward learning; None for agents without one.
         place: the setting in which an expert was trained, or in which another agent is evaluated.
         run: id of the evaluation; empty if it is missing.

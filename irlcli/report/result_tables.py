@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
 from scipy.stats import ttest_ind_from_stats
 
+from irlcli.data.descriptions import Verdict
 from irlcli.report import paper
 from irlcli.report.agents import BASELINES, MEASURES, title
 from irlcli.report.compute import failed_to_imitate
@@ -33,6 +34,15 @@ _LEARNED_NOTE = (
     "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
     "show that the reward is right. The unit is the standard deviation of g on the training data; zero has no "
     "meaning."
+)
+_QUALITY_NOTE = (
+    "How well the frozen reward ranks a bank of policies (idle, random, a ladder of noise on a clone "
+    "of the demonstrations, student, experts, retrained policy): Spearman's correlation of learned "
+    "with true return, over the bank and over the half with the lower true returns, median over seeds "
+    "(least to largest). Expert - idle: learned reward per step, in standard deviations of g, median "
+    "over seeds. The last three count the seeds' retrained policies by verdict: retrained, if the "
+    "regret is within 10 % of what the expert earns above the random agent; else wrong reward, if the "
+    "policy's learned return is at least the expert's; else optimisation fell short."
 )
 _COMPARISON_NOTE = (
     "Two-sided p-values. Welch's test is the primary one. Paired: t-test over the seeds that both "
@@ -156,6 +166,39 @@ def learned_returns(found: pd.DataFrame) -> Table:
     ]
     columns = ["row", "method", "seeds", "retrained policy", "expert", "short", "scored higher"]
     return Table("Learned returns", _LEARNED_NOTE, columns, lines, heads=2)
+
+
+def reward_quality(found: pd.DataFrame) -> Table:
+    """The rewards' assessments, a line per row, method and setting."""
+    lines = []
+    for (row, method, setting), seeds in found.groupby(["row", "agent", "setting"], sort=False):
+        counts = seeds["verdict"].value_counts()
+        judged = int(counts.sum())
+        lines.append(
+            [
+                row,
+                setting.partition("=")[2],
+                title(method),
+                str(len(seeds)),
+                _spread(seeds["spearman"]),
+                _spread(seeds["spearman_low"]),
+                number(seeds["expert_minus_idle"].astype(float).median(), 2),
+                *(f"{counts.get(v, 0)}/{judged}" if judged else "" for v in get_args(Verdict)),
+            ]
+        )
+    columns = ["row", "setting", "method", "seeds", "Spearman", "lower half", "expert - idle"]
+    return Table("Reward quality", _QUALITY_NOTE, [*columns, *get_args(Verdict)], lines, heads=3)
+
+
+def _spread(values: pd.Series) -> str:
+    """The median over seeds, and the range if it has one."""
+    known = values.dropna().astype(float)
+    if known.empty:
+        return "-"
+    middle = number(known.median(), 2)
+    if len(known) == 1:
+        return middle
+    return f"{middle} ({number(known.min(), 2)} to {number(known.max(), 2)})"
 
 
 def comparisons(p: Parameters, found: pd.DataFrame) -> Table:

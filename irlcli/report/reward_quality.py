@@ -37,6 +37,9 @@ class Member(NamedTuple):
         true, learned: returns [n] of the same n episodes.
         steps: [n], over which the learned return sums, absorbing ones included.
         progress: mean over the episodes; None if the environment reports none.
+        ceiling: of the rewards that a retrained policy was trained on; None without.
+        paid, expert_paid: learned returns [n] of a retrained policy and of the setting's expert
+            under its ceiling; None without one.
     """
 
     policy: str
@@ -46,6 +49,9 @@ class Member(NamedTuple):
     learned: np.ndarray
     steps: np.ndarray
     progress: float | None = None
+    ceiling: float | None = None
+    paid: np.ndarray | None = None
+    expert_paid: np.ndarray | None = None
 
 
 class Judgement(NamedTuple):
@@ -205,9 +211,14 @@ def _is_clear(margin: float, of: Measured) -> bool:
 
 
 def split_regret(policy: Member, expert: Member, random: Member) -> RegretSplit:
-    """The true regret of a retrained policy beside the gap of its learned return to the expert."""
+    """The true regret of a retrained policy beside the gap of its learned return to the expert.
+
+    Learned returns are those that the policy was trained for: under its ceiling, if it has one.
+    """
     earned, best, worst = (measured(m.true) for m in (policy, expert, random))
-    gap = difference(measured(expert.learned), measured(policy.learned))
+    paid = policy.learned if policy.paid is None else policy.paid
+    expert_paid = expert.learned if policy.expert_paid is None else policy.expert_paid
+    gap = difference(measured(expert_paid), measured(paid))
     verdict, clear = judge(earned, best, worst, gap)
     return RegretSplit(
         policy=policy.policy,
@@ -215,4 +226,5 @@ def split_regret(policy: Member, expert: Member, random: Member) -> RegretSplit:
         learned_gap=gap,
         verdict=verdict,
         clear=clear,
+        ceiling=policy.ceiling,
     )

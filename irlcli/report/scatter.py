@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from irlcli.data.descriptions import Assessment, BankEntry
+from irlcli.report.agents import title
+from irlcli.report.compute import Assessments
+from irlcli.report.parameters import Parameters
 from irlcli.report.plots import INK, as_svg, plt, style
 
 # Kind of policy to its name in the legend and to Okabe and Ito's colours.
@@ -21,39 +24,75 @@ KINDS = {
 
 
 def draw_bank(directory: Path, assessment: Assessment) -> None:
-    """Write ``scatter.png`` and ``scatter.svg``."""
-    panels = {
+    """Write ``scatter.png`` and ``scatter.svg``: a panel for each setting."""
+    panels = [_by_setting(assessment)]
+    with style("black"):
+        _save(_scatter(panels), directory / "scatter.png")
+    with style(INK):
+        (directory / "scatter.svg").write_text(as_svg(_scatter(panels), "scatter") + "\n")
+
+
+def draw_banks(directory: Path, p: Parameters, assessments: Assessments) -> dict[str, str]:
+    """Write ``bank-ENV-KNOB.png`` for each row: a line of panels per method, all seeds in them.
+
+    Returns:
+        the same as SVGs, by title.
+    """
+    found: dict[str, str] = {}
+    for row in p.rows:
+        lines = []
+        for method in p.methods:
+            seeds = [assessments.get((row.name, method, seed)) for seed in p.seeds]
+            panels: dict[str, list[BankEntry]] = {}
+            for assessment in filter(None, seeds):
+                for setting, entries in _by_setting(assessment).items():
+                    panels.setdefault(f"{title(method)}, {setting}", []).extend(entries)
+            lines += [panels] if panels else []
+        if not lines:
+            continue
+        with style("black"):
+            _save(_scatter(lines), directory / f"bank-{row.env}-{row.knob}.png")
+        with style(INK):
+            name = f"{row.name}: the bank's policies, bars are standard errors over episodes"
+            found[name] = as_svg(_scatter(lines), f"bank{len(found)}")
+    return found
+
+
+def _by_setting(assessment: Assessment) -> dict[str, list[BankEntry]]:
+    return {
         s.setting: [e for e in assessment.bank if e.setting == s.setting]
         for s in assessment.settings
     }
-    with style("black"):
-        figure = scatter(panels)
-        figure.savefig(directory / "scatter.png", dpi=130)
-        plt.close(figure)
-    with style(INK):
-        (directory / "scatter.svg").write_text(as_svg(scatter(panels), "scatter") + "\n")
 
 
-def scatter(panels: Mapping[str, Sequence[BankEntry]]) -> plt.Figure:
+def _save(figure: plt.Figure, path: Path) -> None:
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _scatter(lines: Sequence[Mapping[str, Sequence[BankEntry]]]) -> plt.Figure:
     """A panel for each title; bars are standard errors over episodes."""
-    size = (0.6 + 3.4 * len(panels), 3.6)
-    figure, axes = plt.subplots(1, len(panels), figsize=size, squeeze=False, layout="constrained")
-    for axis, (title, entries) in zip(axes[0], panels.items(), strict=True):
-        for kind, (_, colour) in KINDS.items():
-            found = [e for e in entries if e.kind == kind]
-            axis.errorbar(
-                [e.true.mean for e in found],
-                [e.learned.mean for e in found],
-                [e.learned.error or 0.0 for e in found],
-                [e.true.error or 0.0 for e in found],
-                fmt="o",
-                **{"ms": 5, "color": colour, "lw": 0.8, "alpha": 0.85},
-            )
-        axis.set_title(title)
+    wide = max(len(panels) for panels in lines)
+    size = (0.6 + 3.4 * wide, 0.6 + 3.0 * len(lines))
+    figure, axes = plt.subplots(len(lines), wide, figsize=size, squeeze=False, layout="constrained")
+    for line, panels in zip(axes, lines, strict=True):
+        line[0].set_ylabel("learned return")
+        for axis, (heading, entries) in zip(line, panels.items(), strict=True):
+            for kind, (_, colour) in KINDS.items():
+                found = [e for e in entries if e.kind == kind]
+                axis.errorbar(
+                    [e.true.mean for e in found],
+                    [e.learned.mean for e in found],
+                    [e.learned.error or 0.0 for e in found],
+                    [e.true.error or 0.0 for e in found],
+                    fmt="o",
+                    **{"ms": 5, "color": colour, "lw": 0.8, "alpha": 0.8},
+                )
+            axis.set_title(heading)
+            axis.grid(alpha=0.25)
+    for axis in axes[-1]:
         axis.set_xlabel("true return")
-        axis.grid(alpha=0.25)
-    axes[0, 0].set_ylabel("learned return")
-    drawn = {e.kind for entries in panels.values() for e in entries}
+    drawn = {e.kind for panels in lines for entries in panels.values() for e in entries}
     handles = [
         plt.Line2D([], [], marker="o", ls="", color=colour, label=name)
         for kind, (name, colour) in KINDS.items()

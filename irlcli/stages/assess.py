@@ -23,11 +23,12 @@ from irlcli.stages.base import (
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """A policy of the bank in one setting; ``kind`` as in :mod:`irlcli.report.reward_quality`."""
+    """A policy of the bank in one setting; see :class:`irlcli.report.reward_quality.Member`."""
 
     policy: str
     kind: str
     setting: str
+    ceiling: float | None = None
 
     @property
     def role(self) -> str:
@@ -92,27 +93,41 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, horizon = p.environment.name, p.environment.max_episode_steps
     model, origin = load_reward_file(job.inputs["reward"])
-    places = dict.fromkeys(entry.setting for entry in p.bank)
-    frozen = {place: frozen_reward(p.environment, place, model, origin) for place in places}
-    members, rows = [], []
-    for index, entry in enumerate(p.bank):
+
+    def returns(entry: Entry, ceiling: float | None = None) -> np.ndarray:
+        frozen = frozen_reward(p.environment, entry.setting, model, origin, ceiling)
+        return np.array([frozen.of_episode(t, bounded=True) for t in episodes[entry]])
+
+    episodes, experts = {}, {}
+    for entry in p.bank:
         directory = job.inputs[entry.role]
         recorded = read_demonstrations(directory)
         if recorded.env != env or list(recorded.trajectories) != [entry.setting]:
             raise IntegrityError(f"{directory} holds no episodes in {env} {entry.setting}")
-        trajectories = recorded.trajectories[entry.setting]
+        episodes[entry] = recorded.trajectories[entry.setting]
+        if entry.kind == "expert":
+            experts[entry.setting] = entry
+    members, rows = [], []
+    for index, entry in enumerate(p.bank):
+        # What an absorbing state earns counts up to the horizon.
         absorbing = origin.airl.fixed_horizon
         member = Member(
             policy=entry.policy,
             kind=entry.kind,
             setting=entry.setting,
-            true=np.array([t.episode_return for t in trajectories]),
-            learned=np.array([frozen[entry.setting].of_episode(t) for t in trajectories]),
+            true=np.array([t.episode_return for t in episodes[entry]]),
+            learned=returns(entry),
             steps=np.array(
-                [horizon if absorbing and t.terminated else len(t) for t in trajectories]
+                [horizon if absorbing and t.terminated else len(t) for t in episodes[entry]]
             ),
-            progress=read_json(directory / "summary.json")["mean_progress"],
+            progress=read_json(job.inputs[entry.role] / "summary.json")["mean_progress"],
         )
+        if entry.ceiling is not None and entry.setting in experts:
+            member = member._replace(
+                ceiling=entry.ceiling,
+                paid=returns(entry, entry.ceiling),
+                expert_paid=returns(experts[entry.setting], entry.ceiling),
+            )
         members.append(member)
         rows += [
             {
@@ -125,7 +140,7 @@ def run(job: Job) -> None:
                 "length": len(t),
                 "terminated": t.terminated,
             }
-            for k, t in enumerate(trajectories)
+            for k, t in enumerate(episodes[entry])
         ]
         job.console.progress(index + 1, len(p.bank), "policies", {})
     reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)

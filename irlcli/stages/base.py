@@ -161,12 +161,17 @@ def run_training(job: Job, training: Training) -> list[Row]:
 
 
 def frozen_reward(
-    where: EnvironmentKey, setting: str, model: RewardModel, origin: Reward
+    where: EnvironmentKey,
+    setting: str,
+    model: RewardModel,
+    origin: Reward,
+    ceiling: float | None = None,
 ) -> FrozenReward:
     """The reward that was read from a ``reward.pt``, as it scores episodes in ``setting``.
 
     Raises:
-        UsageError: the reward takes other observations or actions.
+        UsageError: the reward takes other observations or actions, or has no quantiles for a
+            ceiling.
     """
     from contextlib import closing
 
@@ -184,6 +189,7 @@ def frozen_reward(
             where=f"{where.name} {setting}",
             observation_size=observation_size(world.observation_space),
             actions=action_space(world.action_space),
+            ceiling=ceiling,
         )
 
 

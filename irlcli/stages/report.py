@@ -7,7 +7,7 @@ how long, at which commit) are parameters, so that equal requests give equal byt
 from collections.abc import Mapping
 from typing import Any
 
-from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
+from irlcli.report.parameters import ASSESS, EXPERT_BY_REWARD, Parameters
 from irlcli.stages.base import Job, Request, Source, Stage
 
 
@@ -16,7 +16,8 @@ def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
 
     The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. Outputs
     ``README.md``, ``KIND.csv`` (a row per cell), ``seeds.csv`` (a row per seed and setting),
-    ``comparisons.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``.
+    ``comparisons.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``; for each row
+    with an assessed reward ``bank-ENV-KNOB.png``.
     """
     return Request(STAGE, parameters, dict(sources), f"report {parameters.kind}")
 
@@ -27,16 +28,22 @@ def run(job: Job) -> None:
 
     from irlcli.data import descriptions
     from irlcli.data.outputs import write_csv, write_json
-    from irlcli.report import build, page, plots
+    from irlcli.report import build, page, plots, scatter
     from irlcli.store import read_json
 
     p: Parameters = job.parameters
     points: list[dict[str, Any]] = []
+    assessments = {}
     episodes: dict[tuple[str, str], dict[tuple[str, int], Any]] = {}
     for cell in p.cells:
         if not cell.run:
             continue
         directory = job.inputs[cell.role]
+        if cell.measure == ASSESS:
+            path = directory / "assessment.json"
+            assessed = descriptions.convert(read_json(path), descriptions.Assessment, path)
+            assessments[cell.row, cell.agent, cell.seed] = assessed
+            continue
         path = directory / "summary.json"
         summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         of_expert = cell.agent in ("expert", "reused") or cell.measure == EXPERT_BY_REWARD
@@ -72,7 +79,7 @@ def run(job: Job) -> None:
         for seed in p.seeds
         if (role := f"{row.name} {method} {seed} reward-learning") in learning
     }
-    report = build.build(p, pd.DataFrame(points), episodes, rewards)
+    report = build.build(p, pd.DataFrame(points), episodes, rewards, assessments)
     write_csv(job.output / f"{p.kind}.csv", report.cells)
     write_csv(job.output / "seeds.csv", report.points)
     write_csv(job.output / "comparisons.csv", report.comparisons)
@@ -80,8 +87,9 @@ def run(job: Job) -> None:
     (job.output / "README.md").write_text(page.markdown(p, report))
     (job.output / f"{p.kind}.tex").write_text(page.latex(report))
     points_svg = plots.draw_points(job.output, p, report)
+    banks = scatter.draw_banks(job.output, p, assessments)
     curves = plots.learning_curves(p, learning)
-    (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, curves))
+    (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, banks, curves))
 
 
 STAGE = Stage("report", 10, run)

@@ -48,7 +48,7 @@ def test_the_page_is_well_formed_and_self_contained():
     p, points = example(complete())
     p = replace(p, title="<script>alert(1)</script> & co")
     report = build(p, points, {}, {})
-    html = page.html(p, report, "<svg><g/></svg>", {"curves": "<svg></svg>"})
+    html = page.html(p, report, "<svg><g/></svg>", {}, {"curves": "<svg></svg>"})
     tags = parsed(html)
     assert not [a for a in tags.attributes if a[0] == "script" or a[1] in ("src", "onload")]
     links = [value for _, name, value in tags.attributes if name == "href"]
@@ -65,7 +65,7 @@ def test_the_page_is_well_formed_and_self_contained():
 def test_caveats_are_in_every_format():
     p, points = example(complete() | {(BOUNCE, "irm", "transfer"): [5.0, None, None]})
     report = build(p, points, {}, {})
-    html = "".join(parsed(page.html(p, report, "<svg/>", {})).text)
+    html = "".join(parsed(page.html(p, report, "<svg/>", {}, {})).text)
     assert report.caveats
     for caveat in report.caveats:
         assert all(caveat in text for text in (html, page.markdown(p, report), page.latex(report)))
