@@ -418,3 +418,14 @@ def test_any_file_is_taken_or_refused(tmp_path_factory, data):
         assert str(path) in error.message and error.hint
     else:
         assert isinstance(settings, Config)
+
+
+def test_challengers_learn_as_retrained_policies_do():
+    config = load_config("ant")
+    assert config.airl.challenger.ppo == config.transfer.ppo
+    changed = load_config("ant", overrides=["transfer.ppo.n_epochs=3"])
+    assert changed.airl.challenger.ppo.n_epochs == 3
+    own = load_config(
+        "ant", overrides=["transfer.ppo.n_epochs=3", "airl.challenger.ppo.n_epochs=5"]
+    )
+    assert (own.transfer.ppo.n_epochs, own.airl.challenger.ppo.n_epochs) == (3, 5)

@@ -6,9 +6,10 @@ import torch
 from airl_runs import CONFIG, make, random_episodes
 from msgspec.structs import replace
 
-from irlcli.configs import PPOConfig
+from irlcli.configs import ChallengerConfig, PPOConfig
 from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.learners import airl
+from irlcli.rl.challengers import Challengers
 from irlcli.rl.loop import LastRound, Training
 from irlcli.trajectories import join
 
@@ -144,20 +145,46 @@ def test_a_clone_keeps_the_moments_of_its_demonstrations(demos):
     assert float(plain.model.policy.features_extractor.normaliser.count) == 8 * 64
 
 
-@pytest.mark.parametrize("bc_epochs", [0, 2])
-def test_a_resumed_run_equals_an_uninterrupted_one(demos, bc_epochs):
-    """To the byte, the replay and a clone included."""
+def leaves(state, path=""):
+    """Every number and tensor of a nested state, by its path, as bytes."""
+    if isinstance(state, dict | list | tuple):
+        parts = state.items() if isinstance(state, dict) else enumerate(state)
+        return {k: v for name, part in parts for k, v in leaves(part, f"{path}/{name}").items()}
+    if isinstance(state, torch.Tensor):
+        return {path: (state.dtype, tuple(state.shape), state.numpy().tobytes())}
+    return {path: state}
+
+
+# Saved in the middle of a challenger's life, and at its end.
+CHALLENGED = [
+    {
+        "logit": "f",
+        "policy_reward": "f",
+        "gradient_penalty": 1.0,
+        "learning_rate_schedule": "linear",
+    }
+    | {"challenger": ChallengerConfig(life=life, ppo=LONG)}
+    for life in (1, 2)
+]
+
+
+@pytest.mark.parametrize("changes", [{}, {"bc_epochs": 2}, *CHALLENGED])
+def test_a_resumed_run_equals_an_uninterrupted_one(demos, changes):
+    """To the byte, the replay, a clone and challengers included."""
 
     def training():
         trainer, learner = make(
             demos,
             ppo=LONG,
             horizon=HORIZON,
-            bc_epochs=bc_epochs,
             total_steps=3 * LONG.n_envs * LONG.n_steps,
-            **IRM,
+            **(IRM | changes),
         )
-        return Training(trainer, learner, learner, LastRound(), ["one", "other"])
+        challengers = None
+        if learner.config.challenger.life > 0:
+            worlds = trainer._venv.worlds
+            challengers = Challengers(worlds, learner.config.challenger, learner, 0, "test")
+        return Training(trainer, learner, learner, LastRound(), ["one", "other"], challengers)
 
     saved = []
     through = training()
@@ -167,7 +194,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(demos, bc_epochs):
     state, rows = saved[0]
     resumed.load_state_dict(from_bytes(state), rows)
     resumed.run(lambda t, rows: None, pytest.fail)
-    assert to_bytes(resumed.state_dict()) == saved[-1][0]
+    assert leaves(resumed.state_dict()) == leaves(from_bytes(saved[-1][0]))
     assert str(resumed.rows) == str(saved[-1][1])
 
 

@@ -139,3 +139,18 @@ def test_no_replay_is_kept_where_none_is_drawn():
     trainer, learner = make(demos, CONFIG, replay_share=0.0)
     learner.update(0, trainer.train_round(0, learner), trainer.policy)
     assert learner._replay.transitions() == []
+
+
+def test_the_replay_keeps_early_episodes_as_likely_as_late_ones():
+    """Each of 40 episodes is among the 8 kept in a fifth of all runs."""
+    kept = np.zeros(40)
+    runs = 400
+    for seed in range(runs):
+        rng, replay = np.random.default_rng(seed), Replay(1, 2, 8)
+        for start in range(0, 40, 2):
+            replay.add(0, *joined([episode(3, start), episode(3, start + 1)]), rng)
+        (found,) = replay.transitions()
+        kept[np.unique(found.observations).astype(int)] += 1
+    assert kept.sum() == 8 * runs
+    deviation = np.sqrt(0.2 * 0.8 / runs)
+    assert np.abs(kept / runs - 0.2).max() < 4 * deviation

@@ -1,0 +1,191 @@
+"""What makes a reward retrainable: a slope everywhere, challengers, and a ceiling on their pay."""
+
+import numpy as np
+import pytest
+import torch
+from airl_runs import CONFIG, make, random_episodes
+from msgspec.structs import replace
+
+from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
+from irlcli.configs.relevance import relevant_airl
+from irlcli.errors import UsageError
+from irlcli.learners import discriminator
+from irlcli.learners.pools import Minibatch
+from irlcli.learners.reward_model import RewardModel
+from irlcli.penalties import PenaltyOptions
+from irlcli.rl.challengers import Challengers
+
+LONG = PPOConfig(n_envs=8, n_steps=220, batch_size=512, n_epochs=1)
+HORIZON = 200
+CHALLENGED = {
+    "logit": "f",
+    "policy_reward": "f",
+    "challenger": ChallengerConfig(life=2, ppo=LONG, share=0.5),
+    "ppo": LONG,
+}
+
+
+@pytest.fixture(scope="module")
+def demos():
+    return random_episodes(4)
+
+
+def a_batch(size=6, observations=3, actions=2):
+    torch.manual_seed(0)
+    return Minibatch(
+        observations=torch.randn(2, 2, size, observations),
+        actions=torch.randn(2, 2, size, actions),
+        next_observations=torch.randn(2, 2, size, observations),
+        terminated=torch.zeros(2, 2, size),
+        log_probs=torch.randn(2, 2, size),
+    )
+
+
+# The discriminator
+
+
+def test_the_gradient_penalty_of_a_linear_reward_is_its_squared_slope():
+    model = RewardModel(3, 2, False, False, [], "tanh", 0.9)
+    (weight,) = (p for name, p in model.g.named_parameters() if "weight" in name)
+    for share in (0.0, 0.3, 1.0):
+        found = discriminator.gradient_penalty(model, a_batch(), torch.full((2, 6, 1), share))
+        torch.testing.assert_close(found, weight.square().sum())
+    found.backward()
+    torch.testing.assert_close(weight.grad, 2 * weight.detach())
+
+
+def test_the_gradient_is_penalised_between_policy_and_expert():
+    """At the ends of the lines it is the gradient at the policy's or at the expert's samples."""
+    torch.manual_seed(1)
+    model, batch = RewardModel(3, 2, False, True, [8], "tanh", 0.9), a_batch()
+    for label, share in ((0, 0.0), (1, 1.0)):
+        x = batch.observations[:, label].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(model.reward(x, batch.actions[:, label]).sum(), x)
+        # Without observations, the normaliser divides by a deviation of one.
+        expected = slope.square().sum(-1).mean()
+        found = discriminator.gradient_penalty(model, batch, torch.full((2, 6, 1), share))
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
+
+
+def test_logits_may_leave_log_pi_out():
+    model, batch = RewardModel(3, 2, False, False, [8], "tanh", 0.9), a_batch()
+    logits, f = discriminator.discriminator_logits(model, batch, "f")
+    torch.testing.assert_close(logits, f)
+    logits, f = discriminator.discriminator_logits(model, batch)
+    torch.testing.assert_close(logits, f - batch.log_probs)
+
+
+def test_without_shaping_f_is_g():
+    batch = a_batch()
+    model = RewardModel(3, 2, False, False, [8], "tanh", 0.9, shaping=False)
+    g = model.reward(batch.observations, batch.actions)
+    torch.testing.assert_close(discriminator.discriminator_logits(model, batch, "f")[1], g)
+    absorbing_g, absorbing_f = model.absorbing_reward(batch.observations)
+    torch.testing.assert_close(absorbing_g, absorbing_f)
+    assert not any(name.startswith("h") for name in model.state_dict())
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 20.0])
+def test_what_else_is_minimised_is_not_part_of_the_penalty(weight):
+    torch.manual_seed(0)
+    logit, weights = torch.randn(2, 2, 6), torch.tensor([0.25, 0.75])
+    options = PenaltyOptions("logit", unbiased=False)
+    arguments = (logit, logit, weights, False, "irmv1", weight, options)
+    alone = discriminator.discriminator_loss(*arguments)
+    both = discriminator.discriminator_loss(*arguments, share=0.3, beside=torch.tensor(7.0))
+    assert both.penalty == alone.penalty and both.cross_entropy == alone.cross_entropy
+    expected = 0.3 * alone.cross_entropy + 7.0 + weight * alone.penalty
+    torch.testing.assert_close(both.total, expected / max(1.0, weight))
+
+
+def test_a_linear_schedule_ends_at_zero(demos):
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, learning_rate_schedule="linear")
+    (rollout,) = trainer.train_round(0, learner)
+    moved = []
+    for index in (0, trainer.rounds):
+        before = [p.detach().clone() for p in learner.model.parameters()]
+        learner.update(index, [rollout], trainer.policy)
+        after = list(learner.model.parameters())
+        moved.append(max(float((a - b).abs().max()) for a, b in zip(after, before, strict=True)))
+    assert moved[0] > 0.0 and moved[1] == 0.0
+
+
+# Challengers
+
+
+def challenged(demos, **changes):
+    changes = {**CHALLENGED, **changes}
+    trainer, learner = make(demos, horizon=HORIZON, total_steps=5 * 220 * 8, **changes)
+    config = learner.config.challenger
+    worlds = trainer._venv.worlds
+    return trainer, learner, Challengers(worlds, config, learner, 0, "test")
+
+
+def test_each_challenger_starts_from_other_random_weights(demos):
+    _, _, challengers = challenged(demos)
+    first = []
+    for index in range(4):
+        before = index % 2 == 0
+        challengers.train_round(index)
+        if before:
+            first.append(challengers._trainer.policy.state_dict())
+    weights = [next(iter(s.values())) for s in first]
+    assert not torch.equal(*weights)
+
+
+def test_a_challenger_is_paid_the_bounded_reward(demos):
+    trainer, learner, _ = challenged(demos, fixed_horizon=False)
+    (rollout,) = trainer.train_round(0, learner)
+    data = rollout.transitions(slice(None), HORIZON)
+    actions = learner.model.encode(torch.as_tensor(data.actions))
+    with torch.no_grad():
+        g = learner.model.reward(torch.as_tensor(data.observations), actions).numpy()
+    for ceiling in (0.1, 0.9):
+        challenger = replace(learner.config.challenger, ceiling=ceiling)
+        learner.config = replace(learner.config, challenger=challenger)
+        paid = learner.challenger_rewards(rollout, trainer.policy).ravel()
+        highest = np.quantile(learner.quantiles, ceiling)
+        np.testing.assert_allclose(paid, np.minimum(g, highest), rtol=1e-5)
+        assert (paid < g).any()
+
+
+def test_challengers_are_negatives(demos):
+    """With the whole weight on challengers, the student's own samples teach g nothing."""
+    lowered = {}
+    for share in (0.0, 1.0):
+        changes = {"challenger": replace(CHALLENGED["challenger"], share=share)}
+        changes |= {"updates_per_round": 60, "learning_rate": 1e-2, "replay_share": 0.0}
+        trainer, learner, challengers = challenged(demos, **changes)
+        rollouts = trainer.train_round(0, learner)
+        challenge = challengers.train_round(0)
+        # Where the challengers were, made unlike all else.
+        challenge = [replace_observations(r, 5.0) for r in challenge]
+        learner.update(0, rollouts, trainer.policy, challenge)
+        data = challenge[0].transitions(slice(None), HORIZON)
+        with torch.no_grad():
+            actions = learner.model.encode(torch.as_tensor(data.actions))
+            g = learner.model.reward(torch.as_tensor(data.observations), actions)
+        lowered[share] = float(g.mean()) - np.median(learner.quantiles)
+    assert lowered[1.0] < min(lowered[0.0], -1.0)
+
+
+def replace_observations(rollout, value):
+    from dataclasses import replace as changed
+
+    return changed(
+        rollout,
+        observations=np.full_like(rollout.observations, value),
+        next_observations=np.full_like(rollout.next_observations, value),
+    )
+
+
+def test_challengers_need_logits_without_log_pi():
+    airl = AIRLConfig(challenger=ChallengerConfig(life=3))
+    with pytest.raises(UsageError, match=r"airl\.challenger\.life"):
+        relevant_airl(airl, False)
+    relevant_airl(replace(airl, logit="f"), False)
+
+
+def test_challengers_live_in_the_students_worlds():
+    airl = AIRLConfig(logit="f", challenger=ChallengerConfig(life=3, ppo=CONFIG.ppo))
+    assert relevant_airl(airl, True).challenger.ppo.n_envs == airl.ppo.n_envs
