@@ -178,20 +178,33 @@ class Training:
             diagnostics = self.learner.update(index, rollouts, self.trainer.policy, challenge)
             score = self.selector.consider(index, self.trainer.policy)
             rows = [
-                row | of_setting | score
-                for row, of_setting in zip(
+                row | of_setting | of_challenger | score
+                for row, of_setting, of_challenger in zip(
                     episode_rows(index, self.trainer.steps, rollouts, self.settings),
                     diagnostics,
+                    self._of_challenger(index, challenge),
                     strict=True,
                 )
             ]
             self.rows += rows
             self.rounds_done = index + 1
-            for message in self._errors(index, rollouts):
+            for message in self._errors(index, [*rollouts, *challenge]):
                 warn(message)
             after_round(self, rows)
         self.selector.restore(self.trainer.policy)
         return self.rows
+
+    def _of_challenger(self, index: int, challenge: Sequence[Rollout]) -> list[Row]:
+        """What the challenger of round ``index`` earned in each setting, by the true reward."""
+        if not challenge:
+            return [{} for _ in self.settings]
+        return [
+            {
+                "challenger_return": row["true_return"],
+                "challenger_progress": row["progress"],
+            }
+            for row in episode_rows(index, self.trainer.steps, challenge, self.settings)
+        ]
 
     def _errors(self, index: int, rollouts: Sequence[Rollout]) -> list[str]:
         """The worlds whose episode could not go on."""

@@ -220,6 +220,9 @@ def _report(job: Job, training: Training, newest: list[Row]) -> None:
     if "accuracy" in newest[0]:
         accuracy = sum(row["accuracy"] for row in newest) / len(newest)
         facts["discriminator"] = f"accuracy {accuracy:.2f}"
+    if "challenger_return" in newest[0]:
+        returns = [row["challenger_return"] for row in newest]
+        facts["challenger"] = f"return {sum(returns) / len(returns):.0f}"
     trainer = training.trainer
     job.console.progress(trainer.steps, trainer.rounds * trainer.steps_per_round, "steps", facts)
     scalars = {
