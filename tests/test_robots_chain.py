@@ -48,10 +48,13 @@ def test_a_robots_reward_is_assessed(chains, irl, tmp_path):
     common = ["--store", store, "--profile", "smoke", "--quiet"]
     done = irl("assess", "airl", "--ood", "gravity", *common, "--json")
     assert done.code == 0, done.err
-    bank = json.loads(done.out)["assessment"]["bank"]
+    assessment = json.loads(done.out)["assessment"]
+    bank = assessment["bank"]
     kinds = {"idle", "random", "clone", "student", "reused", "retrained"}
     assert {e["kind"] for e in bank} == kinds and len(bank) == 11
     assert all(e["progress"] is not None for e in bank)
+    # The Reacher's true reward is a function of what is observed.
+    assert 0.0 < assessment["settings"][0]["epic"] < 1.0 and assessment["epic_missing"] == ""
 
 
 @pytest.mark.parametrize(

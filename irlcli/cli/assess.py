@@ -108,9 +108,11 @@ def _print(assessment: Assessment) -> None:
     columns = ["setting", "policy", "true return", "progress", "learned return"]
     out.print_table(columns, rows, stderr=True)
     columns = ["setting", "policies", "Spearman", "Pearson", "lower half", "Spearman", "Pearson"]
-    columns += ["expert - idle", "return distance"]
+    columns += ["expert - idle", "return distance", "EPIC"]
     every = [*assessment.settings, *([assessment.pooled] if assessment.pooled else [])]
     out.print_table(columns, [_ranked(s) for s in every], stderr=True)
+    if assessment.epic_missing:
+        out.print_note(f"no EPIC distance: {assessment.epic_missing}")
     splits: list[list[Any]] = [
         [
             s.setting,
@@ -139,9 +141,10 @@ def _ranked(found: Assessed) -> list[str]:
     cells = [found.setting or "all"]
     for part in (found.overall, found.lower_half):
         cells += [str(part.policies), _interval(part.spearman), _interval(part.pearson)]
-    gap, distance = found.expert_minus_idle, found.return_distance
+    gap = found.expert_minus_idle
     cells.append("-" if gap is None else _measured(gap, 3))
-    return [*cells, "-" if distance is None else f"{distance:.2f}"]
+    distances = (found.return_distance, found.epic)
+    return [*cells, *("-" if d is None else f"{d:.2f}" for d in distances)]
 
 
 def _interval(found: Interval | None) -> str:

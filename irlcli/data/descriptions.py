@@ -238,6 +238,8 @@ class Assessed(Struct, frozen=True, kw_only=True):
         expert_minus_idle: learned reward per step, expert minus idle, in standard deviations of
             g; None without an expert.
         return_distance: episode-return correlation pseudometric (Gleave et al. 2021).
+        epic: EPIC distance (the same paper); None where the true reward is not known as a function
+            of a transition.
         retrained: every policy retrained on the reward in this setting.
     """
 
@@ -246,17 +248,22 @@ class Assessed(Struct, frozen=True, kw_only=True):
     lower_half: Agreement
     expert_minus_idle: Measured | None = None
     return_distance: Finite | None = None
+    epic: Finite | None = None
     retrained: tuple[RegretSplit, ...] = ()
 
 
 class Assessment(Struct, frozen=True, kw_only=True):
-    """``assessment.json``: a learned reward, measured on a bank of policies."""
+    """``assessment.json``: a learned reward, measured on a bank of policies.
+
+    ``epic_missing`` says why there is no EPIC distance; empty if there is one.
+    """
 
     env: str
     reward: LearnedReward
     settings: Annotated[tuple[Assessed, ...], Meta(min_length=1)]
     pooled: Assessed | None
     bank: tuple[BankEntry, ...]
+    epic_missing: str = ""
 
 
 class SettingReturn(Struct, frozen=True, kw_only=True):

@@ -6,7 +6,11 @@ Gymnasium 1 has no plugin entry points. Import this module to register the envir
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib import import_module
+
 import gymnasium
+import numpy as np
 
 from irlcli.envs.registry import ENVIRONMENTS, environment
 from irlcli.interventions import Setting, env_kwargs
@@ -37,3 +41,12 @@ def make(env: str, setting: Setting, render_mode: str | None = None) -> gymnasiu
 
 
 register()
+
+
+def transition_reward(env: str) -> Callable[..., np.ndarray] | None:
+    """The true reward [B] as a function of (s, a, s'); None where it depends on more than that."""
+    name = environment(env).transition_reward
+    if name is None:
+        return None
+    module, _, function = name.partition(":")
+    return getattr(import_module(module), function)

@@ -40,6 +40,9 @@ class EnvironmentSpec(NamedTuple):
             and rewards from ``train-maxent``.
         physics: version of the dynamics and the true reward. It is part of every key: increase
             it with each change that alters trajectories.
+        transition_reward: ``module:function`` of the true reward [B] as a function of
+            observations, actions and next observations, where it is one; else None.
+        unobserved: what the true reward depends on besides them, as the end of a sentence.
     """
 
     name: str
@@ -50,3 +53,5 @@ class EnvironmentSpec(NamedTuple):
     discrete_actions: bool = False
     tabular: bool = False
     physics: int = 1
+    transition_reward: str | None = None
+    unobserved: str = "an unknown quantity"

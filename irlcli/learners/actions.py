@@ -43,9 +43,11 @@ class ActionView:
 
     def of(self, data: Transitions) -> Transitions:
         """``data`` with the actions that the learner sees."""
-        if not self.clipped:
-            return data
-        return replace(data, actions=np.clip(data.actions, self._space.low, self._space.high))
+        return replace(data, actions=self.seen(data.actions)) if self.clipped else data
+
+    def seen(self, actions: np.ndarray) -> np.ndarray:
+        """What the learner sees of ``actions`` [B] or [B, A]."""
+        return np.clip(actions, self._space.low, self._space.high) if self.clipped else actions
 
     def log_prob(self, policy: Policy, data: Transitions, gradient: bool = False) -> torch.Tensor:
         """log pi(a|s) [B] of transitions that :meth:`of` returned."""

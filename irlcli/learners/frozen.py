@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 
 from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
@@ -80,6 +81,16 @@ class FrozenReward:
         data = self._view.of(rollout.transitions(slice(None), self._horizon))
         pay = bounded_pay(self._model, data, self._ceiling, self._absorbing, self._gamma)
         return (pay / self._scale).numpy().reshape(rollout.terminated.shape)
+
+    def of_transitions(
+        self, observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray
+    ) -> np.ndarray:
+        """g / scale [B] of single steps, without ceiling. It does not depend on the successors."""
+        seen = self._view.seen(actions)
+        with torch.no_grad():
+            vectors = self._model.encode(torch.as_tensor(seen))
+            g = self._model.reward(torch.as_tensor(observations), vectors)
+        return g.double().numpy() / self._scale
 
     def of_episode(self, trajectory: Trajectory, bounded: bool = False) -> float:
         """The undiscounted learned return of a whole episode; ``bounded`` by the ceiling if asked.

@@ -1,10 +1,11 @@
-"""An assessment of a learned reward, from the returns of a bank of policies; and as tables."""
+"""An assessment of a learned reward, from the returns of a bank of policies."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from irlcli.data.descriptions import (
     Assessed,
@@ -23,10 +24,21 @@ from irlcli.report.reward_quality import (
 )
 
 
-def assess(env: str, reward: LearnedReward, members: Sequence[Member]) -> Assessment:
-    """All numbers about ``reward``, by setting and over all settings together."""
+def assess(
+    env: str,
+    reward: LearnedReward,
+    members: Sequence[Member],
+    epic: Mapping[str, float | None],
+    epic_missing: str = "",
+) -> Assessment:
+    """All numbers about ``reward``, by setting and over all settings together.
+
+    ``epic`` are EPIC distances by setting, and ``epic_missing`` says why there are none.
+    """
     places = list(dict.fromkeys(m.setting for m in members))
-    settings = tuple(_in(place, [m for m in members if m.setting == place]) for place in places)
+    settings = tuple(
+        _in(place, [m for m in members if m.setting == place], epic.get(place)) for place in places
+    )
     return Assessment(
         env=env,
         reward=reward,
@@ -43,6 +55,7 @@ def assess(env: str, reward: LearnedReward, members: Sequence[Member]) -> Assess
             )
             for m in members
         ),
+        epic_missing=epic_missing,
     )
 
 
@@ -55,17 +68,14 @@ def _ranked(setting: str, members: Sequence[Member]) -> Assessed:
     )
 
 
-def _in(setting: str, members: Sequence[Member]) -> Assessed:
-    found = _ranked(setting, members)
+def _in(setting: str, members: Sequence[Member], epic: float | None) -> Assessed:
+    found = replace(_ranked(setting, members), epic=epic)
     of = {m.kind: m for m in members}
     if "expert" not in of:
         return found
     retrained = [m for m in members if m.kind == "retrained"]
-    return Assessed(
-        setting=setting,
-        overall=found.overall,
-        lower_half=found.lower_half,
-        return_distance=found.return_distance,
+    return replace(
+        found,
         expert_minus_idle=difference(_per_step(of["expert"]), _per_step(of["idle"])),
         retrained=tuple(split_regret(m, of["expert"], of["random"]) for m in retrained),
     )

@@ -5,10 +5,12 @@ The bank only measures: no reward and no policy learns from it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
+from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.stages.base import (
     EnvironmentKey,
@@ -20,6 +22,13 @@ from irlcli.stages.base import (
     environment_key,
     frozen_reward,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from irlcli.data.descriptions import Reward
+    from irlcli.learners.reward_model import RewardModel
+    from irlcli.trajectories import Trajectory
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,12 +88,10 @@ def run(job: Job) -> None:
     import numpy as np
     import pyarrow as pa
 
-    from irlcli.data.demonstrations import read_demonstrations
     from irlcli.data.descriptions import LearnedReward
     from irlcli.data.outputs import write_json
     from irlcli.data.parquet import write_table
     from irlcli.data.tensors import load_reward_file
-    from irlcli.errors import IntegrityError
     from irlcli.report import scatter
     from irlcli.report.assessment import assess
     from irlcli.report.reward_quality import Member
@@ -93,20 +100,13 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, horizon = p.environment.name, p.environment.max_episode_steps
     model, origin = load_reward_file(job.inputs["reward"])
+    episodes = {entry: _episodes(job, entry) for entry in p.bank}
+    experts = {entry.setting: entry for entry in p.bank if entry.kind == "expert"}
 
     def returns(entry: Entry, ceiling: float | None = None) -> np.ndarray:
         frozen = frozen_reward(p.environment, entry.setting, model, origin, ceiling)
         return np.array([frozen.of_episode(t, bounded=True) for t in episodes[entry]])
 
-    episodes, experts = {}, {}
-    for entry in p.bank:
-        directory = job.inputs[entry.role]
-        recorded = read_demonstrations(directory)
-        if recorded.env != env or list(recorded.trajectories) != [entry.setting]:
-            raise IntegrityError(f"{directory} holds no episodes in {env} {entry.setting}")
-        episodes[entry] = recorded.trajectories[entry.setting]
-        if entry.kind == "expert":
-            experts[entry.setting] = entry
     members, rows = [], []
     for index, entry in enumerate(p.bank):
         # What an absorbing state earns counts up to the horizon.
@@ -144,10 +144,51 @@ def run(job: Job) -> None:
         ]
         job.console.progress(index + 1, len(p.bank), "policies", {})
     reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)
-    assessment = assess(env, reward, members)
+    epic, epic_missing = _epic_distances(p.environment, model, origin, episodes)
+    assessment = assess(env, reward, members, epic, epic_missing)
     write_json(job.output / "assessment.json", msgspec.to_builtins(assessment))
     write_table(pa.Table.from_pylist(rows), job.output / "bank.parquet")
     scatter.draw_bank(job.output, assessment)
 
 
-STAGE = Stage("assess", 1, run)
+def _episodes(job: Job, entry: Entry) -> Sequence[Trajectory]:
+    from irlcli.data.demonstrations import read_demonstrations
+    from irlcli.errors import IntegrityError
+
+    env, directory = job.parameters.environment.name, job.inputs[entry.role]
+    recorded = read_demonstrations(directory)
+    if recorded.env != env or list(recorded.trajectories) != [entry.setting]:
+        raise IntegrityError(f"{directory} holds no episodes in {env} {entry.setting}")
+    return recorded.trajectories[entry.setting]
+
+
+def _epic_distances(
+    where: EnvironmentKey,
+    model: RewardModel,
+    origin: Reward,
+    episodes: Mapping[Entry, Sequence[Trajectory]],
+) -> tuple[dict[str, float | None], str]:
+    """By setting, over steps of the random agent and of the setting's expert (or the student).
+
+    Without a true reward of transitions none, and the reason.
+    """
+    from irlcli.envs.registration import transition_reward
+    from irlcli.report.epic import Coverage, epic_distance
+    from irlcli.trajectories import transitions
+
+    true = transition_reward(where.name)
+    if true is None:
+        what = environment(where.name).unobserved
+        return {}, f"the true reward of {where.name} also depends on {what}"
+    found = {}
+    for place in dict.fromkeys(entry.setting for entry in episodes):
+        here = {entry.kind: group for entry, group in episodes.items() if entry.setting == place}
+        good = here.get("expert", here.get("student", ()))
+        data = transitions([*here["random"], *good], where.max_episode_steps)
+        coverage = Coverage(data.observations, data.actions, data.next_observations)
+        learned = frozen_reward(where, place, model, origin).of_transitions
+        found[place] = epic_distance(true, learned, coverage, origin.network.gamma)
+    return found, ""
+
+
+STAGE = Stage("assess", 2, run)

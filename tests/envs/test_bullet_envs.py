@@ -14,8 +14,8 @@ import pytest
 from bullet_robots import ROBOTS, body
 from gymnasium.utils.env_checker import check_env
 
-import irlcli.envs.registration  # noqa: F401 (registers the environments)
 from irlcli.envs.ant.env import Ant
+from irlcli.envs.registration import transition_reward
 from irlcli.envs.vector import VectorWorlds
 
 EVERY = [(name, model) for name in ROBOTS for model in ("merged", "original")]
@@ -261,3 +261,28 @@ def test_resets_do_not_leak_memory():
         env.reset(seed=0)
     env.close()
     assert resident() - before < 8 * 2**20
+
+
+def test_the_reachers_reward_is_a_function_of_the_transition():
+    """Step by step, also beyond the action bounds and at the elbow's limit."""
+    stuck = 0
+    for seed, gravity in ((0, 0.5), (1, 4.0), (2, 1.0)):
+        env = gymnasium.make("irlcli/Reacher-v0", gravity=gravity).unwrapped
+        rng = np.random.default_rng(seed)
+        observation, _ = env.reset(seed=seed)
+        steps = []
+        for t in range(150):
+            # The second half bends the elbow to its limit.
+            action = rng.uniform(-2, 2, 2) if t < 75 else np.array([0.0, 1.5])
+            after, reward, _, _, info = env.step(action)
+            steps.append((observation, action, after, reward))
+            stuck += info["stuck"] < 0
+            observation = after
+        s, a, s_next, rewards = (np.array(part) for part in zip(*steps, strict=True))
+        found = transition_reward("reacher")(s, a, s_next)
+        np.testing.assert_allclose(found, rewards, atol=1e-5)
+    assert stuck > 10
+
+
+def test_other_robots_rewards_are_no_functions_of_the_transition():
+    assert transition_reward("ant") is None and transition_reward("half-cheetah") is None

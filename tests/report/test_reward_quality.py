@@ -184,7 +184,7 @@ TRIPLE = (("retrained", 10.0), ("expert", 100.0), ("random", 0.0))
 
 
 def reward(members):
-    return assess("ant", LearnedReward(method="erm", seed=0, settings=("e",)), members)
+    return assess("ant", LearnedReward(method="erm", seed=0, settings=("e",)), members, {})
 
 
 def test_expert_minus_idle_is_per_step():

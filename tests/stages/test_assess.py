@@ -62,6 +62,15 @@ def test_its_numbers_are_those_of_evaluations(assessed, irl):
         assert entry["learned"]["mean"] == pytest.approx(row["mean_learned_return"])
 
 
+def test_epic_is_not_available_and_the_output_says_why(assessed, irl):
+    path, document = assessed
+    assessment = document["assessment"]
+    assert all(s["epic"] is None for s in assessment["settings"])
+    assert "the hull touches the ground" in assessment["epic_missing"]
+    shown = irl("assess", "airl", "--store", path, *SMOKE).err
+    assert f"no EPIC distance: {assessment['epic_missing']}" in shown
+
+
 def test_its_files(assessed):
     path, document = assessed
     artefact = Store(path).resolve("assessed").artefact

@@ -12,4 +12,5 @@ SPEC = EnvironmentSpec(
         **WALKER_KNOBS,
         "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
     },
+    unobserved="the positions of its parts one substep ago",
 )

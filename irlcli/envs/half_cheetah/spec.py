@@ -14,4 +14,5 @@ SPEC = EnvironmentSpec(
             "leg_length", ("absolute", "multiplier"), 0.2, 5.0, "length of both legs"
         ),
     },
+    unobserved="the position of its torso one substep ago",
 )

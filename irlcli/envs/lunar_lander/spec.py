@@ -15,4 +15,5 @@ SPEC = EnvironmentSpec(
         ),
     },
     discrete_actions=True,
+    unobserved="whether the hull touches the ground and whether the lander sleeps",
 )

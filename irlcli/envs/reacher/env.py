@@ -177,3 +177,17 @@ class Reacher(RobotEnv):
             dtype=np.float32,
         )
         return observation, -100.0 * math.hypot(x, y)
+
+
+def transition_reward(
+    observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray
+) -> np.ndarray:
+    """The true reward [B] of steps from ``observations`` to ``next_observations`` [B, 9].
+
+    It is that of :meth:`Reacher.step`, up to the observations' single precision.
+    """
+    before, after = (np.linalg.norm(o[:, 2:4], axis=1) for o in (observations, next_observations))
+    effort = np.abs(np.clip(actions, -1.0, 1.0))
+    work = (effort * np.abs(next_observations[:, [6, 8]])).sum(1)
+    stuck = np.abs(np.abs(next_observations[:, 7]) - 1.0) < 0.01
+    return 100.0 * (before - after) - 0.1 * work - 0.01 * effort.sum(1) - 0.1 * stuck

@@ -9,4 +9,5 @@ SPEC = EnvironmentSpec(
     max_episode_steps=150,
     knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "multiple of 9.8 m/s^2")},
     physics=2,
+    transition_reward="irlcli.envs.reacher.env:transition_reward",
 )
