@@ -98,6 +98,7 @@ class Plan:
             yield from rows.comparison(
                 row,
                 self.table.measures,
+                self.table.retrainings,
                 self._runs(row),
                 self._configs,
                 Chosen(self.selection.candidates, self.lookup),

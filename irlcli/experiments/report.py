@@ -54,6 +54,7 @@ def request(plan: Plan, command: str) -> Request:
         rows=tuple(_rows(plan)),
         methods=plan.table.methods,
         seeds=plan.table.seeds,
+        retrainings=plan.table.retrainings,
         cells=tuple(cells),
         runs=runs,
         libraries=libraries,
@@ -153,17 +154,20 @@ def _rows(plan: Plan) -> list[Row]:
         config = plan.configs(row.env)
         listed = config.interventions[row.knob]
         trained, unseen = (
-            [str(s) for s in parse_settings(row.env, f"{row.knob}={','.join(values)}")]
+            parse_settings(row.env, f"{row.knob}={','.join(values)}")
             for values in (listed.id, listed.ood)
         )
         demos = plan.tasks[f"{plan.selection.tag}.{row}.demos"].request
-        tree = msgspec.to_builtins(config)
+        tree = msgspec.to_builtins(config) | {
+            "expert": msgspec.to_builtins(config.expert_of(unseen[0])),
+            "transfer": msgspec.to_builtins(config.transfer_of(unseen[0])),
+        }
         rows.append(
             Row(
                 env=row.env,
                 knob=row.knob,
-                trained=tuple(trained),
-                unseen=unseen[0],
+                trained=tuple(map(str, trained)),
+                unseen=str(unseen[0]),
                 demonstrations=demos.parameters.episodes,
                 config={stage: tree[stage] for stage in _CONFIGS},
                 chosen=_chosen(plan, str(row)),

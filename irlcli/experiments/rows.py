@@ -7,6 +7,9 @@ A task's name is that of its row and what it makes::
     ROW.expert.VALUE.returns                                     in the expert's own setting
     ROW.expert.VALUE.reused-returns  ....reused-id-returns       in the unseen one, in all trained
     ROW.METHOD.SEED.zero-shot-returns  ....id-returns  ....transfer-returns  ....expert-by-reward
+    ROW.METHOD.SEED.from-student  ....from-student-returns
+    ROW.METHOD.SEED.transfer-id.VALUE  ....transfer-id.VALUE-returns
+    ROW.METHOD.SEED.transfer.1  ....transfer.1-returns  ...      further retrainings
     ROW.METHOD.SEED.choice                                       lambda, with --choose-penalty
     ROW.clone  ROW.bank.POLICY.VALUE  ROW.METHOD.SEED.bank.POLICY.VALUE  ROW.METHOD.SEED.assess
 """
@@ -24,6 +27,7 @@ from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
 from irlcli.interventions import Setting, parse_settings
 from irlcli.methods import fields
+from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
 from irlcli.report.parameters import ASSESS, EXPERT_BY_REWARD, Cell
 from irlcli.stages import (
     assess,
@@ -41,6 +45,9 @@ from irlcli.store import file_digest, read_json
 
 Phase = Literal["experts", "demos", "rewards", "transfers", "returns"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
+# A reward's first policy is retrained with the reward's own seed, the next ones with seeds that no
+# other reward uses.
+_NEXT_RETRAINING = 1000
 # The config of an environment, under flags such as ``airl.penalty``.
 Configs = Callable[[str, Mapping[str, Any] | None], Config]
 
@@ -142,11 +149,14 @@ class _RowRequests:
 def comparison(
     row: Row,
     measures: Sequence[str],
+    retrainings: int,
     runs: Sequence[tuple[str, int]],
     configs: Configs,
     chosen: Chosen,
 ) -> Iterator[Task]:
     """The tasks of a row that compares ``runs`` of (method, seed); each after what it needs.
+
+    Each reward is retrained ``retrainings`` times.
 
     Raises:
         UsageError: the settings list no values of the knob, or not one unseen one.
@@ -170,17 +180,18 @@ def comparison(
     yield Task(name, "returns", request, requests.cell("expert", "ood", place=place))
     for e in trained:
         expert, label = requests.expert(e), f"expert of {e}"
-        if "id" in measures:
+        in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
+        if in_distribution:
             name, request = requests.own_returns(e)
             yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
         for measure, places in (("ood", unseen), ("id", trained)):
-            if measure == "ood" or "id" in measures:
+            if measure == "ood" or in_distribution:
                 name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
                 request = requests.returns(places, expert, policy_label=label)
                 cell = requests.cell("reused", measure, place=str(e))
                 yield Task(name, "returns", request, cell)
     for name, seed in runs:
-        yield from _run(requests, demos, name, seed, measures, configs, chosen)
+        yield from _run(requests, demos, name, seed, measures, retrainings, configs, chosen)
 
 
 def _run(
@@ -189,6 +200,7 @@ def _run(
     method_name: str,
     seed: int,
     measures: Sequence[str],
+    retrainings: int,
     configs: Configs,
     chosen: Chosen,
 ) -> Iterator[Task]:
@@ -224,24 +236,20 @@ def _run(
         cell = requests.cell(method_name, "id", seed)
         request = requests.returns(trained, learned, policy_label=student)
         yield Task(f"{name}.id-returns", "returns", request, cell)
-    moved = None
+    retrained: dict[str, list[Retrained]] = {}
+    for measure in RETRAINED:
+        if measure in measures:
+            for retraining in range(retrainings):
+                for place in trained if measure == "transfer-id" else unseen:
+                    moved = _retraining(requests, learned, seed, measure, place, retraining)
+                    where = str(place) if measure == "transfer-id" else ""
+                    cell = requests.cell(method_name, measure, seed, where, retraining=retraining)
+                    yield from _retrained(requests, learned, moved, cell, place)
+                    ceiling = moved.parameters.transfer.ceiling
+                    known_as = _known_as(measure, retraining)
+                    member = Retrained(known_as, From(moved, "policy.pt"), ceiling)
+                    retrained.setdefault(str(place), []).append(member)
     if "transfer" in measures:
-        moved = transfer.request(
-            From(learned, "reward.pt"),
-            env,
-            unseen[0],
-            requests.config.transfer_of(unseen[0]),
-            seed,
-            learner,
-        )
-        yield Task(f"{name}.transfer", "transfers", moved)
-        cell = requests.cell(method_name, "transfer", seed)
-        label = f"transfer {method_name} of seed {seed}"
-        request = requests.returns(
-            unseen, moved, reward=learned, policy_label=label, reward_label=learner
-        )
-        curves = {"transfer-learning": moved}
-        yield Task(f"{name}.transfer-returns", "returns", request, cell, curves)
         cell = requests.cell(method_name, EXPERT_BY_REWARD, seed, str(unseen[0]))
         expert, label = requests.expert(unseen[0]), f"expert of {unseen[0]}"
         request = requests.returns(
@@ -249,14 +257,14 @@ def _run(
         )
         yield Task(f"{name}.expert-by-reward", "returns", request, cell)
     if ASSESS in measures:
-        yield from _assessment(requests, demos, learned, moved, method_name, seed)
+        yield from _assessment(requests, demos, learned, retrained, method_name, seed)
 
 
 def _assessment(
     requests: _RowRequests,
     demos: Request,
     learned: Request,
-    moved: Request | None,
+    retrained: Mapping[str, Sequence[Retrained]],
     method_name: str,
     seed: int,
 ) -> Iterator[Task]:
@@ -266,16 +274,12 @@ def _assessment(
     imitation = clone.request(From(demos), row.env, trained, requests.config)
     yield Task(f"{row}.clone", "returns", imitation)
     experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}
-    retrained = []
-    if moved is not None:
-        ceiling = moved.parameters.transfer.ceiling
-        retrained = [Retrained("retrained", From(moved, "policy.pt"), ceiling)]
     policies = Policies(
         clone=From(imitation, "policy.pt"),
         student=From(learned, "policy.pt"),
         reused={str(e): experts[str(e)] for e in trained},
         experts=experts,
-        retrained={str(unseen[0]): retrained},
+        retrained=retrained,
     )
     members = bank(row.env, places, requests.config, policies)
     for entry, recorded in members.items():
@@ -287,6 +291,52 @@ def _assessment(
     request = assess.request(From(learned, "reward.pt"), row.env, members, label)
     cell = requests.cell(method_name, ASSESS, seed)
     yield Task(f"{row}.{method_name}.{seed}.assess", "returns", request, cell)
+
+
+def _known_as(measure: str, retraining: int) -> str:
+    """A retrained policy's name in a bank; no two in one setting share it."""
+    name = "retrained from the student" if measure == "from-student" else "retrained"
+    return f"{name} {retraining + 1}" if retraining else name
+
+
+def _retraining(
+    requests: _RowRequests,
+    learned: Request,
+    seed: int,
+    measure: str,
+    place: Setting,
+    retraining: int,
+) -> Request:
+    """A policy trained on one reward in ``place``."""
+    return transfer.request(
+        From(learned, "reward.pt"),
+        requests.row.env,
+        place,
+        requests.config.transfer_of(place),
+        seed + retraining * _NEXT_RETRAINING,
+        f"{train_airl.describe(learned.parameters.airl)} seed {seed}",
+        From(learned, "policy.pt") if measure == "from-student" else None,
+    )
+
+
+def _retrained(
+    requests: _RowRequests, learned: Request, moved: Request, cell: Cell, place: Setting
+) -> Iterator[Task]:
+    """The policy of ``moved``, and what it earns in ``place``, by the reward too."""
+    name = f"{requests.row}.{cell.agent}.{cell.seed}.{cell.measure}"
+    name += f".{_value(place)}" if cell.place else ""
+    name += f".{cell.retraining}" if cell.retraining else ""
+    yield Task(name, "transfers", moved)
+    request = requests.returns(
+        [place],
+        moved,
+        reward=learned,
+        policy_label=f"{cell.measure} {cell.agent} of seed {cell.seed}",
+        reward_label=f"{train_airl.describe(learned.parameters.airl)} seed {cell.seed}",
+    )
+    first = cell.measure == "transfer" and not cell.retraining
+    curves = {"transfer-learning": moved} if first else {}
+    yield Task(f"{name}-returns", "returns", request, cell, curves)
 
 
 def _choice(name: str, choice: Request) -> Iterator[Task]:

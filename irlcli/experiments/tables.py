@@ -14,7 +14,7 @@ from irlcli.interventions import knob_of
 from irlcli.methods import METHODS
 
 Kind = Literal["comparison", "experts", "figure2"]
-Measure = Literal["transfer", "zero-shot", "id", "assess"]
+Measure = Literal["transfer", "from-student", "zero-shot", "transfer-id", "id", "assess"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 _NAME = r"[a-z][a-z0-9-]{0,30}"
 _DEFAULTS = "defaults"
@@ -38,6 +38,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
         kind: a ``comparison`` of methods has rows, methods, seeds and measures. A file lists none
             of them for the other kinds: ``experts`` has a row for every intervention in
             ``settings/``, ``figure2`` is about the gridworld.
+        retrainings: of each reward, for every measure of a retrained policy.
         settings: a TOML file laid over the profile.
     """
 
@@ -48,6 +49,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     methods: tuple[str, ...] = ()
     seeds: tuple[int, ...] = ()
     measures: tuple[Measure, ...] = ()
+    retrainings: int = 1
     settings: Path | None = None
 
 
@@ -155,7 +157,7 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
             )
     comparing = ("rows", "methods", "seeds", "measures")
     if kind != "comparison":
-        for field in comparing:
+        for field in (*comparing, "retrainings"):
             if field in value:
                 raise UsageError(f"{name}.{field}: kind {kind!r} has no {field}", f"omit {field}")
         return Table(name=name, title=title, kind=kind, settings=settings)
@@ -177,6 +179,11 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
         if type(seed) is not int or seed < 0:
             raise UsageError(f"{name}.seeds: {seed!r} is not a seed", "a whole number from 0")
     _check_list(f"{name}.seeds", filled["seeds"])
+    retrainings = filled.get("retrainings", 1)
+    if type(retrainings) is not int or retrainings < 1:
+        raise UsageError(
+            f"{name}.retrainings: {retrainings!r} is not a count", "a whole number from 1"
+        )
     return Table(
         name=name,
         title=title,
@@ -185,6 +192,7 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
         methods=tuple(filled["methods"]),
         seeds=tuple(filled["seeds"]),
         measures=tuple(filled["measures"]),
+        retrainings=retrainings,
         settings=settings,
     )
 

@@ -10,9 +10,14 @@ BASELINES = {
 }
 MEASURES = {
     "transfer": "Transfer: the policy retrained on the frozen reward, in the held-out setting",
+    "from-student": "From the student: retrained from the student on, in the held-out setting",
     "zero-shot": "Zero-shot: the student, in the held-out setting",
+    "transfer-id": "Transfer in distribution: a policy retrained in each training setting, their mean",
     "id": "In distribution: the student, mean over the training settings",
 }
+# Measures of policies trained on the frozen reward, and measures in the training settings.
+RETRAINED = ("transfer", "from-student", "transfer-id")
+IN_DISTRIBUTION = ("transfer-id", "id")
 # For methods outside the table: what Okabe and Ito's palette has left, then greys.
 _OTHER_COLOURS = ("#56B4E9", "#D55E00", "#F0E442", "#777777", "#AAAAAA")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from irlcli.report import caveats, compute, result_tables
+from irlcli.report import caveats, compute, result_tables, retrained
 from irlcli.report.parameters import Parameters
 from irlcli.report.tables import Table
 
@@ -21,6 +21,8 @@ class Report:
         points: a row per evaluation and setting, see :mod:`irlcli.report.compute`.
         cells: see :func:`irlcli.report.compute.summarise_cells`.
         comparisons: see :func:`irlcli.report.compute.compare_methods`.
+        by_training_setting: see :func:`irlcli.report.retrained.by_training_setting`.
+        against_zero_shot: see :func:`irlcli.report.retrained.against_zero_shot`.
         learned_returns: see :func:`irlcli.report.compute.learned_returns`.
         discriminators: see :func:`irlcli.report.compute.discriminator_ends`.
         reward_quality: see :func:`irlcli.report.compute.reward_quality`.
@@ -31,6 +33,8 @@ class Report:
     points: pd.DataFrame
     cells: pd.DataFrame
     comparisons: pd.DataFrame
+    by_training_setting: pd.DataFrame
+    against_zero_shot: pd.DataFrame
     learned_returns: pd.DataFrame
     discriminators: pd.DataFrame
     reward_quality: pd.DataFrame
@@ -56,11 +60,15 @@ def build(
     """
     cells = compute.summarise_cells(p, points)
     comparisons = compute.compare_methods(p, points, cells)
+    by_training_setting = retrained.by_training_setting(p, points)
+    against_zero_shot = retrained.against_zero_shot(p, points)
     learned_returns = compute.learned_returns(p, points)
     discriminators = compute.discriminator_ends(p, learning)
     quality = compute.reward_quality(p, assessments)
     tables = [
         *result_tables.measures(p, cells, comparisons),
+        result_tables.by_training_setting(by_training_setting),
+        result_tables.against_zero_shot(against_zero_shot),
         result_tables.learned_returns(learned_returns),
         result_tables.reward_quality(quality),
         result_tables.comparisons(p, comparisons),
@@ -82,7 +90,16 @@ def build(
     ]
     tables = [table for table in tables if table.rows]
     return Report(
-        points, cells, comparisons, learned_returns, discriminators, quality, tables, found
+        points,
+        cells,
+        comparisons,
+        by_training_setting,
+        against_zero_shot,
+        learned_returns,
+        discriminators,
+        quality,
+        tables,
+        found,
     )
 
 
@@ -96,6 +113,8 @@ def as_json(report: Report) -> dict[str, Any]:
     return {
         "cells": records(report.cells),
         "comparisons": records(report.comparisons),
+        "by_training_setting": records(report.by_training_setting),
+        "against_zero_shot": records(report.against_zero_shot),
         "learned_returns": records(report.learned_returns),
         "discriminators": records(report.discriminators),
         "reward_quality": records(report.reward_quality),

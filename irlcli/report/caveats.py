@@ -17,7 +17,7 @@ from irlcli.report.text import percent
 # At this accuracy, the gradient of the penalty is close to zero.
 SATURATED = 0.95
 
-Episodes = Mapping[tuple[str, str], Mapping[tuple[str, int], np.ndarray]]
+Episodes = Mapping[tuple[str, str], Mapping[tuple[str, str], np.ndarray]]
 
 
 def missing(p: Parameters) -> list[str]:
@@ -100,7 +100,8 @@ def identical(episodes: Episodes) -> list[str]:
     """Runs that are bitwise equal: seeds that are no sample, or a method without effect.
 
     Args:
-        episodes: the true returns by (row, measure), then (method, seed).
+        episodes: the true returns by (row, measure), then (method, seed); the seed's text also
+            names the setting and the retraining if there are several.
     """
     groups: dict[tuple[str, tuple], list[str]] = {}
     for (row, measure), found in episodes.items():

@@ -4,8 +4,9 @@ Every function takes *points*, a row per evaluation and setting with the columns
 
     row           ENV KNOB
     agent         method or baseline
-    measure       transfer, zero-shot, id, ood, or "expert by reward"
+    measure       see :class:`irlcli.report.parameters.Cell`
     seed          of the reward learning; missing for baselines
+    retraining    number of the policy trained on that seed's reward, from 0
     expert_of     the setting in which an expert was trained
     setting       the setting of the evaluation
     true_return, progress, learned_return
@@ -20,10 +21,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from irlcli.data.descriptions import Assessment, Interval, Measured, Verdict
-from irlcli.report.agents import BASELINES, comparisons
+from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, comparisons
 from irlcli.report.lineage import evaluations, is_mixed, origins
 from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
 from irlcli.report.reward_quality import judge
@@ -46,12 +48,25 @@ Assessments = Mapping[tuple[str, str, int | None], Assessment]
 
 
 def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
-    """``true_return`` and ``progress`` by seed, means over settings."""
-    chosen = points[
-        (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
-    ]
-    by_seed = chosen.groupby("seed", dropna=False, sort=True)
+    """``true_return`` and ``progress`` by seed, means over settings and retrainings."""
+    by_seed = points_of(points, row, agent, measure).groupby("seed", dropna=False, sort=True)
     return by_seed[["true_return", "progress"]].mean()
+
+
+def points_of(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
+    of = (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
+    return points[of]
+
+
+def between_retrainings(points: pd.DataFrame, row: str, agent: str, measure: str) -> float | None:
+    """Deviation (n - 1) of the true return between policies trained on one reward, pooled.
+
+    The root of the mean variance over rewards; None if no reward was retrained twice.
+    """
+    chosen = points_of(points, row, agent, measure)
+    means = chosen.groupby(["seed", "retraining"])["true_return"].mean()
+    variances = means.groupby("seed").var().dropna()
+    return float(np.sqrt(variances.mean())) if len(variances) else None
 
 
 def imitates(student: float | None, expert: float | None) -> bool | None:
@@ -78,12 +93,12 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     return over seeds; ``progress``, its mean; ``complete``, whether all evaluations exist;
     ``mixed``, whether the runs behind them differ in code or libraries; ``of_expert``, the mean
     over that of the training settings' experts, in distribution; ``imitated``, see
-    :func:`imitates`.
+    :func:`imitates`; ``between_retrainings``, see :func:`between_retrainings`.
     """
     found = []
     for row in p.rows:
         wanted = [(agent, "ood") for agent in BASELINES]
-        if "id" in p.measures:
+        if not set(IN_DISTRIBUTION).isdisjoint(p.measures):
             wanted += [("expert", "id"), ("reused", "id")]
         wanted += [(method, m) for m in p.measures for method in p.methods]
         for agent, measure in wanted:
@@ -99,7 +114,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "row": row.name,
                     "agent": agent,
                     "measure": measure,
-                    "setting": ", ".join(row.trained) if measure == "id" else row.unseen,
+                    "setting": ", ".join(row.trained) if measure in IN_DISTRIBUTION else row.unseen,
                     "seeds": s.n,
                     "seeds_wanted": len(p.seeds) if agent in p.methods else 1,
                     "mean": s.mean,
@@ -107,6 +122,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "low": low,
                     "high": high,
                     "iqm": s.iqm,
+                    "between_retrainings": between_retrainings(points, row.name, agent, measure),
                     "progress": None if math.isnan(progress) else float(progress),
                     "complete": all(c.run for c in planned),
                     "mixed": is_mixed(origins(p, evaluations(planned))),
@@ -123,10 +139,13 @@ def _with_imitation(p: Parameters, table: pd.DataFrame) -> pd.DataFrame:
     for r in table.itertuples():
         expert, mean = expert_means.get(r.row), None if pd.isna(r.mean) else r.mean
         is_student = r.agent in p.methods
-        known = r.measure == "id" and expert is not None and mean is not None
-        compared = known and (is_student or (r.agent == "reused" and r.complete))
+        known = r.measure in IN_DISTRIBUTION and expert is not None and mean is not None
+        # A student's evaluation covers all training settings, the others have one for each.
+        whole = r.complete or (is_student and r.measure == "id")
+        compared = known and whole and r.agent != "expert"
         of_expert.append(mean / expert if compared and expert > 0 else None)
-        imitated.append(imitates(mean, expert) if known and is_student else None)
+        imitates_ = known and is_student and r.measure == "id"
+        imitated.append(imitates(mean, expert) if imitates_ else None)
     return table.assign(
         of_expert=pd.array(of_expert, "Float64"), imitated=pd.array(imitated, "boolean")
     )
@@ -193,6 +212,9 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             of = points[(points["row"] == row.name) & (points["agent"] == method)]
             of = of[of["learned_return"].notna()]
             policies, experts = (of[of["measure"] == m] for m in ("transfer", EXPERT_BY_REWARD))
+            policies = policies.groupby("seed", as_index=False)[
+                ["true_return", "learned_return"]
+            ].mean()
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
                 continue

@@ -171,6 +171,7 @@ def _seeds(report: Report) -> Table:
             title(point.agent),
             point.measure,
             number(point.seed, 0),
+            str(point.retraining),
             point.setting,
             number(point.true_return),
             number(point.progress),
@@ -180,10 +181,19 @@ def _seeds(report: Report) -> Table:
         ]
         for point in report.points.itertuples()
     ]
-    columns = ["row", "agent", "measure", "seed", "setting", "true return", "progress"]
+    columns = [
+        "row",
+        "agent",
+        "measure",
+        "seed",
+        "retraining",
+        "setting",
+        "true return",
+        "progress",
+    ]
     columns += ["learned return", "episodes", "evaluation"]
     note = "Means over the episodes of an evaluation."
-    return Table("Every seed in numbers", note, columns, rows, 5)
+    return Table("Every seed in numbers", note, columns, rows, 6)
 
 
 def _lineage(p: Parameters) -> str:
@@ -192,6 +202,7 @@ def _lineage(p: Parameters) -> str:
     for cell in p.cells:
         if cell.run:
             seed = "" if cell.seed is None else f", seed {cell.seed}"
+            seed += f", retraining {cell.retraining}" if cell.retraining else ""
             place = f", {cell.place}" if cell.place else ""
             heading = f"{cell.row}, {title(cell.agent)}, {cell.measure}{place}{seed}"
             tree = escape("\n".join(_tree(p, cell.run, "")))

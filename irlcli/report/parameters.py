@@ -21,14 +21,16 @@ class Cell(msgspec.Struct, frozen=True):
         row: ``ENV KNOB``.
         agent: a method, ``expert``, ``random``, ``idle``, or ``reused``: the expert of a training
             setting, evaluated in the settings in which the students are evaluated.
-        measure: ``transfer`` (the retrained policy), ``zero-shot`` or ``id`` (the student, in the
-            held-out setting or in distribution), ``ood`` for an agent without a reward,
-            ``expert by reward``: the held-out setting's expert, scored by this seed's reward, or
-            ``assess``: the reward itself, measured on a bank of policies.
+        measure: ``transfer`` (the retrained policy), ``from-student`` (retrained from the student
+            on), ``transfer-id`` (retrained in a training setting, ``place``), ``zero-shot`` or
+            ``id`` (the student, in the held-out setting or in distribution), ``ood`` for an agent
+            without a reward, ``expert by reward``: the held-out setting's expert, scored by this
+            seed's reward, or ``assess``: the reward itself, measured on a bank of policies.
         seed: of the reward learning; None for agents without one.
         place: the setting in which an expert was trained, or in which another agent is evaluated.
         run: id of the evaluation; empty if it is missing.
         why: what a missing one waits for.
+        retraining: number of the policy trained on this seed's reward, from 0.
     """
 
     row: str
@@ -38,12 +40,14 @@ class Cell(msgspec.Struct, frozen=True):
     place: str = ""
     run: str = ""
     why: str = ""
+    retraining: int = 0
 
     @property
     def role(self) -> str:
         """Name of the evaluation among the stage's inputs."""
         seed = "-" if self.seed is None else self.seed
-        return f"{self.row} {self.agent} {seed} {self.measure} {self.place}".strip()
+        text = f"{self.row} {self.agent} {seed} {self.measure} {self.place}".strip()
+        return f"{text} retraining {self.retraining}" if self.retraining else text
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,7 +118,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         kind: of report, such as ``table1``.
         command: the command line that produces this report; printed in it.
-        measures: of ``transfer``, ``zero-shot`` and ``id``.
+        measures: keys of :data:`irlcli.report.agents.MEASURES`.
+        retrainings: policies trained on each reward.
         runs: provenance of the artefacts, by id.
         libraries: the sets of library versions that occur, by a short name.
     """
@@ -126,6 +131,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     rows: tuple[Row, ...]
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
+    retrainings: int = 1
     cells: tuple[Cell, ...]
     runs: dict[str, Run]
     libraries: dict[str, dict[str, str | None]]

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from irlcli.report.agents import BASELINES, colours, title
+from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, colours, title
 from irlcli.report.build import Report
 from irlcli.report.compute import sample
 from irlcli.report.parameters import Parameters, Row
@@ -102,7 +102,7 @@ def _panel(axis: plt.Axes, p: Parameters, report: Report, row: Row, measure: str
     cells = report.cells[report.cells["row"] == row.name].set_index(["agent", "measure"])
     for agent in BASELINES:
         # Drawn even without a value, because all panels share the first one's legend.
-        value = cells["mean"].get((agent, "id" if measure == "id" else "ood"))
+        value = cells["mean"].get((agent, "id" if measure in IN_DISTRIBUTION else "ood"))
         axis.axhline(
             np.nan if pd.isna(value) else value,
             color=ink,

@@ -10,7 +10,7 @@ from scipy.stats import ttest_ind_from_stats
 
 from irlcli.data.descriptions import Verdict
 from irlcli.report import paper
-from irlcli.report.agents import BASELINES, MEASURES, title
+from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
 from irlcli.report.compute import failed_to_imitate
 from irlcli.report.lineage import commits, duration, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
@@ -25,6 +25,18 @@ _MAIN_NOTE = (
     "evaluated where the students are, their mean: the return without learning a reward. Progress: "
     "the part of the return earned by walking or reaching (an idle ant earns about 600 for being "
     "alive)."
+)
+_RETRAININGS_NOTE = (
+    " Each reward was retrained {} times: the return of a seed is the mean over them, and ± does not "
+    "hold their spread (see *Every cell*)."
+)
+_SETTING_NOTE = (
+    "A policy retrained from scratch in each training setting. Mean true return ± standard deviation "
+    "over seeds, and its share of the return of that setting's own expert."
+)
+_ZERO_SHOT_NOTE = (
+    "The student before and after retraining on its own reward in the held-out setting, over the "
+    "seeds that have both. Better: seeds in which retraining earned more. p: paired t-test, two-sided."
 )
 _LEARNED_NOTE = (
     "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
@@ -61,7 +73,8 @@ _DISCRIMINATOR_NOTE = (
 )
 _CELL_NOTE = (
     "95 %: percentile bootstrap interval of the mean over seeds, too narrow with few seeds. IQM: "
-    "mean of the middle half of the seeds. Expert, random and idle are one policy each; the reused "
+    "mean of the middle half of the seeds. Retrainings: standard deviation between policies trained on "
+    "one reward, pooled over rewards; the sd over seeds is of their means. Expert, random and idle are one policy each; the reused "
     "experts are one policy per training setting."
 )
 _BUDGET_NOTE = (
@@ -76,7 +89,8 @@ _COST_NOTE = (
 
 def measures(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[Table]:
     """A table per measure, with the note below the first."""
-    notes = [_MAIN_NOTE] + [""] * len(p.measures)
+    several = _RETRAININGS_NOTE.format(p.retrainings) if p.retrainings > 1 else ""
+    notes = [_MAIN_NOTE + several] + [""] * len(p.measures)
     return [
         _measure(p, measure, note, cells, comparisons)
         for measure, note in zip(p.measures, notes, strict=False)
@@ -87,9 +101,10 @@ def _measure(
     p: Parameters, measure: str, note: str, cells: pd.DataFrame, comparisons: pd.DataFrame
 ) -> Table:
     """A line per row for its return, and more for progress and for the paper's numbers."""
-    baseline = "id" if measure == "id" else "ood"
+    in_distribution = measure in IN_DISTRIBUTION
+    baseline = "id" if in_distribution else "ood"
     agents = [*p.methods, "expert", "reused"]
-    agents += [] if measure == "id" else ["random", "idle"]
+    agents += [] if in_distribution else ["random", "idle"]
     first = comparisons[(comparisons["x"] == "irm") & (comparisons["y"] == "erm")]
     tested = {r.row: r for r in first[first["measure"] == measure].itertuples()}
     lines = []
@@ -99,14 +114,14 @@ def _measure(
             for r in cells[cells["row"] == row.name].itertuples()
             if r.measure == (baseline if r.agent in BASELINES else measure)
         }
-        values = row.trained if measure == "id" else (row.unseen,)
+        values = row.trained if in_distribution else (row.unseen,)
         where = f"{row.name} = {', '.join(text.partition('=')[2] for text in values)}"
         test = tested.get(row.name)
         tests = ["-", "-"] if test is None else [p_value(test.p_welch), p_value(test.p_welch_holm)]
         lines.append([where, "return", *(_cell(own[a]) for a in agents), *tests])
         if any(not pd.isna(own[a].progress) for a in agents):
             lines.append([where, "progress", *(number(own[a].progress) for a in agents), "", ""])
-        if measure == "id":
+        if in_distribution:
             ratios = {a: own[a].of_expert for a in agents if a != "expert"}
             shares = {a: "-" if r is pd.NA else f"{r:.0%}" for a, r in ratios.items()}
             lines.append([where, "of the expert", *(shares.get(a, "") for a in agents), "", ""])
@@ -148,6 +163,46 @@ def _cell(cell: Any) -> str:
     if failed_to_imitate(cell):
         text += " †"
     return text + (" ‡" if cell.mixed else "")
+
+
+def by_training_setting(found: pd.DataFrame) -> Table:
+    """The policies retrained in distribution, each beside its setting's expert."""
+    lines = [
+        [
+            r.row,
+            r.setting,
+            title(r.agent),
+            str(r.seeds),
+            f"{r.mean:.1f}" + ("" if pd.isna(r.deviation) else f" ± {r.deviation:.1f}"),
+            number(r.progress),
+            number(r.expert),
+            "-" if pd.isna(r.of_expert) else f"{r.of_expert:.0%}",
+        ]
+        for r in found.itertuples()
+    ]
+    columns = ["row", "setting", "method", "seeds", "retrained policy", "progress", "expert"]
+    columns += ["of the expert"]
+    return Table("Retrained in distribution, by setting", _SETTING_NOTE, columns, lines, heads=3)
+
+
+def against_zero_shot(found: pd.DataFrame) -> Table:
+    """The student before and after retraining."""
+    lines = [
+        [
+            r.row,
+            title(r.agent),
+            str(r.pairs),
+            number(r.zero_shot),
+            number(r.from_student),
+            number(r.difference),
+            f"{r.better}/{r.pairs}",
+            p_value(r.p_paired),
+        ]
+        for r in found.itertuples()
+    ]
+    columns = ["row", "method", "seeds", "zero-shot", "from the student", "difference", "better"]
+    columns += ["p"]
+    return Table("From the student, against zero-shot", _ZERO_SHOT_NOTE, columns, lines, heads=2)
 
 
 def learned_returns(found: pd.DataFrame) -> Table:
@@ -266,11 +321,13 @@ def cells(found: pd.DataFrame) -> Table:
             number(r.deviation),
             "-" if pd.isna(r.low) else f"[{r.low:.1f}, {r.high:.1f}]",
             number(r.iqm),
+            number(r.between_retrainings),
             number(r.progress),
         ]
         for r in found.itertuples()
     ]
-    columns = ["row", "agent", "measure", "seeds", "mean", "sd", "95 %", "IQM", "progress"]
+    columns = ["row", "agent", "measure", "seeds", "mean", "sd", "95 %", "IQM"]
+    columns += ["retrainings", "progress"]
     return Table("Every cell", _CELL_NOTE, columns, lines, heads=3)
 
 
@@ -288,7 +345,9 @@ def budgets(p: Parameters) -> Table:
                 ", ".join(f"{run}: {weight:g}" for run, weight in row.chosen.items())
                 or f"{config['airl']['penalty_weight']:g}",
                 config["airl"]["select"],
-                f"{config['transfer']['total_steps']:,}" if "transfer" in p.measures else "-",
+                f"{config['transfer']['total_steps']:,}"
+                if {"transfer", "transfer-id"} & set(p.measures)
+                else "-",
                 str(config["evaluation"]["episodes"]),
             ]
         )

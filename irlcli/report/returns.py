@@ -124,7 +124,7 @@ def agent_name(policy: Subject, setting: str) -> str:
         return f"expert of {', '.join(policy.settings)}"
     method = title(policy.method or "")
     if agent == "transfer":
-        return f"{method} retrained policy"
+        return f"{method} retrained policy" + (", from its student" if policy.from_student else "")
     if agent == "student":
         demonstrated = (parse_setting(policy.env, text) for text in policy.settings)
         seen = any(covers(s, parse_setting(policy.env, setting)) for s in demonstrated)

@@ -34,7 +34,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     points: list[dict[str, Any]] = []
     assessments = {}
-    episodes: dict[tuple[str, str], dict[tuple[str, int], Any]] = {}
+    episodes: dict[tuple[str, str], dict[tuple[str, str], Any]] = {}
     for cell in p.cells:
         if not cell.run:
             continue
@@ -53,6 +53,7 @@ def run(job: Job) -> None:
                 "agent": cell.agent,
                 "measure": cell.measure,
                 "seed": cell.seed,
+                "retraining": cell.retraining,
                 "expert_of": cell.place if of_expert else "",
                 "setting": place.setting,
                 "true_return": place.mean_return,
@@ -66,7 +67,10 @@ def run(job: Job) -> None:
         if cell.seed is not None and cell.measure in p.measures:
             returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
             group = episodes.setdefault((cell.row, cell.measure), {})
-            group[cell.agent, cell.seed] = returns["true_return"].to_numpy()
+            which = f"{cell.seed}"
+            which += f" in {cell.place}" if cell.place else ""
+            which += f" retraining {cell.retraining}" if cell.retraining else ""
+            group[cell.agent, which] = returns["true_return"].to_numpy()
     learning = {
         role: pd.read_parquet(path)
         for role, path in job.inputs.items()
@@ -92,4 +96,4 @@ def run(job: Job) -> None:
     (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, banks, curves))
 
 
-STAGE = Stage("report", 10, run)
+STAGE = Stage("report", 11, run)

@@ -59,6 +59,7 @@ def example(values, **more):
                         "agent": agent,
                         "measure": measure,
                         "seed": seed,
+                        "retraining": 0,
                         "setting": "bounce=0.9",
                         "true_return": value,
                         "progress": None,

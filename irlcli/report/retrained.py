@@ -1,0 +1,68 @@
+"""How policies do that were trained on the frozen rewards: by training setting, and from the student.
+
+Points are those of :mod:`irlcli.report.compute`.
+"""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from irlcli.report.compute import points_of, sample
+from irlcli.report.parameters import Parameters
+from irlcli.report.statistics import paired_p, summarise
+
+
+def by_training_setting(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
+    """Policies retrained in each training setting, a row per row, setting and method.
+
+    Columns: ``row``, ``setting``, ``agent``, ``seeds``; ``mean`` and ``deviation`` (n - 1) of the
+    true return over seeds, each the mean of its retrainings; ``progress``, its mean; ``expert``,
+    the return of that setting's own expert; ``of_expert``, the mean over it, None unless the
+    expert's is positive.
+    """
+    columns = ["row", "setting", "agent", "seeds", "mean", "deviation", "progress"]
+    columns += ["expert", "of_expert"]
+    found = []
+    for row in p.rows if "transfer-id" in p.measures else ():
+        experts = points_of(points, row.name, "expert", "id").set_index("setting")["true_return"]
+        for setting in row.trained:
+            expert = experts.get(setting)
+            for method in p.methods:
+                of = points_of(points, row.name, method, "transfer-id")
+                by_seed = of[of["setting"] == setting].groupby("seed")
+                means = by_seed[["true_return", "progress"]].mean()
+                if means.empty:
+                    continue
+                s = summarise(means["true_return"].tolist())
+                progress = means["progress"].mean()
+                share = s.mean / expert if expert is not None and expert > 0 else None
+                found.append(
+                    (row.name, setting, method, s.n, s.mean, s.deviation, progress, expert, share)
+                )
+    return pd.DataFrame(found, columns=columns)
+
+
+def against_zero_shot(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
+    """Whether retraining from the student improves on it, a row per row and method.
+
+    Columns: ``row``, ``agent``; ``pairs``, seeds that have both returns; ``zero_shot`` and
+    ``from_student``, their mean true returns; ``difference``; ``better``, seeds in which
+    retraining earned more; ``p_paired``, two-sided p of the paired t-test.
+    """
+    columns = ["row", "agent", "pairs", "zero_shot", "from_student", "difference", "better"]
+    columns += ["p_paired"]
+    found = []
+    for row in p.rows if {"from-student", "zero-shot"} <= set(p.measures) else ():
+        for method in p.methods:
+            before, after = (
+                sample(points, row.name, method, measure)["true_return"]
+                for measure in ("zero-shot", "from-student")
+            )
+            common = before.index.intersection(after.index)
+            if not len(common):
+                continue
+            gain = after[common] - before[common]
+            paired = paired_p(after[common].tolist(), before[common].tolist())
+            means = float(before[common].mean()), float(after[common].mean()), float(gain.mean())
+            found.append((row.name, method, len(common), *means, int((gain > 0).sum()), paired))
+    return pd.DataFrame(found, columns=columns)
