@@ -54,6 +54,7 @@ def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataF
 
 
 def points_of(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
+    """The points of one row, agent and measure."""
     of = (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
     return points[of]
 

@@ -27,8 +27,8 @@ _MAIN_NOTE = (
     "alive)."
 )
 _RETRAININGS_NOTE = (
-    " Each reward was retrained {} times: the return of a seed is the mean over them, and ± does not "
-    "hold their spread (see *Every cell*)."
+    " Each reward was retrained {} times: the return of a seed is their mean, and ± is over seeds. "
+    "*Every cell* has the deviation between retrainings of one reward."
 )
 _SETTING_NOTE = (
     "A policy retrained from scratch in each training setting. Mean true return ± standard deviation "

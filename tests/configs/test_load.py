@@ -429,3 +429,29 @@ def test_challengers_learn_as_retrained_policies_do():
         "ant", overrides=["transfer.ppo.n_epochs=3", "airl.challenger.ppo.n_epochs=5"]
     )
     assert (own.transfer.ppo.n_epochs, own.airl.challenger.ppo.n_epochs) == (3, 5)
+
+
+@pytest.mark.parametrize("env", ["ant", "half-cheetah", "lunar-lander", "reacher"])
+def test_retraining_is_as_strong_as_the_experts_training(env):
+    """The same steps and the same PPO in every setting, on normalised rewards."""
+    config = load_config(env)
+    for knob, values in config.interventions.items():
+        for setting in parse_settings(env, f"{knob}={','.join((*values.id, *values.ood))}"):
+            expert, transfer = config.expert_of(setting), config.transfer_of(setting)
+            assert transfer.total_steps == expert.total_steps
+            assert transfer.ppo.normalise_rewards
+            own = {"normalise_rewards": True}
+            if env == "lunar-lander":
+                own |= {"gamma": 0.99, "gae_lambda": 0.95}
+            assert transfer.ppo == msgspec.structs.replace(expert.ppo, **own)
+
+
+def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():
+    (legs,) = parse_settings("ant", "leg-length=3x")
+    (friction,) = parse_settings("ant", "friction=2:0.6:0.6")
+    config = load_config("ant")
+    assert config.transfer_of(legs).ppo.use_sde and not config.transfer_of(friction).ppo.use_sde
+    plain = load_config("ant", overrides=["transfer.ppo.use_sde=false"])
+    assert not plain.transfer_of(legs).ppo.use_sde
+    sac = load_config("ant", flags={"transfer.algorithm": "sac"})
+    assert {sac.transfer_of(s).algorithm for s in (legs, friction)} == {"sac"}

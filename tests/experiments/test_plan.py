@@ -6,6 +6,9 @@ import json
 
 import pytest
 
+from irlcli.configs import load_config
+from irlcli.experiments.rows import Chosen, comparison
+from irlcli.experiments.tables import Row, Table
 from irlcli.store import Store
 
 TABLES = """
@@ -175,3 +178,48 @@ def test_the_command_of_a_step_makes_it(plan, irl, tmp_path):
     recorded = artefact.provenance()["command"]
     assert recorded[: len(command)] == command
     assert plan(store)[name]["status"] == "HIT"
+
+
+def test_each_measure_of_a_retrained_policy_has_its_own_steps(irl, tmp_path):
+    tables = tmp_path / "tables.toml"
+    measures = 'measures = ["transfer", "from-student", "transfer-id"]\nretrainings = 2'
+    tables.write_text(TABLES.replace('measures = ["transfer"]', measures))
+    words = ["plan", "tiny", "--experiments", tables, "--profile", "smoke", "--json"]
+    done = irl(*words, "--store", tmp_path / "none")
+    assert done.code == 0, done.err
+    steps = {s["name"].removeprefix(f"{ROW}."): s for s in json.loads(done.out)["steps"]}
+    policies = [
+        f"irm.0.{what}{again}"
+        for what in ("transfer", "from-student", "transfer-id.1x", "transfer-id.1.25x")
+        for again in ("", ".1")
+    ]
+    for name in policies:
+        assert steps[name]["needs"] == [f"{ROW}.irm.0"]
+        assert steps[f"{name}-returns"]["needs"] == [f"{ROW}.{name}", f"{ROW}.irm.0"]
+    assert {"expert.1x.returns", "expert.1.25x.returns"} <= set(steps)
+    assert sum(".transfer" in name or ".from-student" in name for name in steps) == 16
+
+
+def test_further_retrainings_have_seeds_of_their_own():
+    """Retraining 0 keeps the reward's seed; no two policies share one."""
+    table = Table(
+        name="t",
+        title="t",
+        rows=(Row("reacher", "gravity"),),
+        methods=("erm",),
+        seeds=(0, 1),
+        measures=("transfer",),
+        retrainings=3,
+    )
+    tasks = comparison(
+        table.rows[0],
+        table.measures,
+        table.retrainings,
+        [("erm", seed) for seed in table.seeds],
+        lambda env, flags: load_config(env, "smoke", flags=flags),
+        Chosen((), None),
+    )
+    found = {t.name: t.request.parameters.seed for t in tasks if t.phase == "transfers"}
+    assert found["reacher.gravity.erm.0.transfer"] == 0
+    assert found["reacher.gravity.erm.1.transfer"] == 1
+    assert len(found) == len(set(found.values())) == 6

@@ -1,0 +1,101 @@
+"""Policies retrained in distribution, from the student, and several times on one reward."""
+
+import msgspec
+import pandas as pd
+import pytest
+from report_examples import BOUNCE, cell, column, complete, example, table
+
+from irlcli.report.build import as_json, build
+
+MEASURES = ("transfer", "from-student", "transfer-id", "zero-shot", "id")
+
+
+def with_points(p, points, *more):
+    """The report with further points; each is (agent, measure, seed, retraining, setting, return)."""
+    columns = ["agent", "measure", "seed", "retraining", "setting", "true_return"]
+    added = pd.DataFrame([dict(zip(columns, m, strict=True)) for m in more])
+    added = added.assign(row=BOUNCE, episodes=20, evaluation="0" * 16)
+    both = pd.concat([points, added.reindex(columns=points.columns)], ignore_index=True)
+    return build(p, both.astype({"progress": "float", "learned_return": "float"}), {}, {})
+
+
+def test_retrainings_are_averaged_and_their_spread_is_told_apart():
+    values = complete()
+    del values[BOUNCE, "irm", "transfer"]
+    p, points = example(values, retrainings=2)
+    returns = {0: (10.0, 14.0), 1: (20.0, 20.0)}
+    report = with_points(
+        p,
+        points,
+        *(
+            ("irm", "transfer", seed, k, "bounce=0.9", value)
+            for seed, pair in returns.items()
+            for k, value in enumerate(pair)
+        ),
+    )
+    found = cell(report, BOUNCE, "irm", "transfer")
+    # The means of the rewards are 12 and 20. Their retrainings' variances are 8 and 0.
+    assert (found["seeds"], found["mean"]) == (2, 16.0)
+    assert found["deviation"] == pytest.approx(32**0.5)
+    assert found["between_retrainings"] == pytest.approx(2.0)
+    assert pd.isna(cell(report, BOUNCE, "erm", "transfer")["between_retrainings"])
+    # The paired test compares the means: 12 - 1 and 20 - 2.
+    first = report.comparisons.iloc[0]
+    assert (first["pairs"], first["difference"]) == (2, 16.0 - 2.0)
+    assert "retrained 2 times" in report.tables[0].note
+    assert (
+        "retrained" not in build(*example(complete()), {}, {}).tables[0].note.split("Progress")[1]
+    )
+
+
+def test_retraining_in_distribution_is_a_share_of_each_settings_own_expert():
+    values = complete()
+    del values[BOUNCE, "expert", "id"]
+    p, points = example(values, measures=MEASURES)
+    report = with_points(
+        p,
+        points,
+        ("expert", "id", None, 0, "bounce=0.1", 200.0),
+        ("expert", "id", None, 0, "bounce=0.5", 100.0),
+        ("erm", "transfer-id", 0, 0, "bounce=0.1", 100.0),
+        ("erm", "transfer-id", 0, 0, "bounce=0.5", 90.0),
+        ("erm", "transfer-id", 1, 0, "bounce=0.1", 180.0),
+    )
+    found = report.by_training_setting.set_index(["row", "setting", "agent"])
+    first, second = (found.loc[(BOUNCE, f"bounce={v}", "erm")] for v in ("0.1", "0.5"))
+    assert (first["seeds"], first["mean"], first["of_expert"]) == (2, 140.0, 0.7)
+    assert (second["seeds"], second["mean"], second["of_expert"]) == (1, 90.0, 0.9)
+    shown = table(report, "Retrained in distribution, by setting")
+    assert column(shown, "of the expert") == ["70%", "90%"]
+    assert "by_training_setting" in as_json(report)
+
+
+def test_retraining_from_the_student_is_compared_with_the_same_seeds_student():
+    values = complete()
+    values[BOUNCE, "erm", "from-student"] = [130.0, 115.0, 110.0]
+    p, points = example(values, measures=MEASURES)
+    report = build(p, points, {}, {})
+    (found,) = report.against_zero_shot.to_dict("records")
+    # The students earn 100, 110 and 120.
+    assert (found["agent"], found["pairs"], found["better"]) == ("erm", 3, 2)
+    assert found["difference"] == pytest.approx((30 + 5 - 10) / 3)
+    assert 0.0 < found["p_paired"] < 1.0
+    assert column(table(report, "From the student, against"), "better") == ["2/3"]
+    without, points = example(values, measures=("transfer", "zero-shot", "id"))
+    assert build(without, points, {}, {}).against_zero_shot.empty
+
+
+def test_measures_in_distribution_stand_beside_the_training_settings_experts():
+    values = complete()
+    values[BOUNCE, "erm", "transfer-id"] = [125.0]
+    p, points = example(values, measures=MEASURES)
+    report = build(p, points, {}, {})
+    found = cell(report, BOUNCE, "erm", "transfer-id")
+    # The expert earns 250; one of several evaluations may be missing, which is no share.
+    assert found["of_expert"] == 0.5 and pd.isna(found["imitated"])
+    missing = [c for c in p.cells if (c.agent, c.measure) == ("erm", "transfer-id")]
+    part = msgspec.structs.replace(
+        missing[0], run="", place="bounce=0.5", why="transfer has not run"
+    )
+    p = msgspec.structs.replace(p, cells=(*p.cells, part))
+    assert pd.isna(cell(build(p, points, {}, {}), BOUNCE, "erm", "transfer-id")["of_expert"])
