@@ -223,3 +223,21 @@ def test_further_retrainings_have_seeds_of_their_own():
     assert found["reacher.gravity.erm.0.transfer"] == 0
     assert found["reacher.gravity.erm.1.transfer"] == 1
     assert len(found) == len(set(found.values())) == 6
+
+
+def test_a_bank_holds_every_retrained_policy(irl, tmp_path):
+    tables = tmp_path / "tables.toml"
+    measures = 'measures = ["transfer", "from-student", "transfer-id", "assess"]\nretrainings = 2'
+    tables.write_text(TABLES.replace('measures = ["transfer"]', measures))
+    words = ["plan", "tiny", "--experiments", tables, "--profile", "smoke", "--json"]
+    done = irl(*words, "--store", tmp_path / "none")
+    assert done.code == 0, done.err
+    steps = {s["name"].removeprefix(f"{ROW}."): s for s in json.loads(done.out)["steps"]}
+    needs = {n.removeprefix(f"{ROW}.") for n in steps["irm.0.assess"]["needs"]}
+    assert {n for n in needs if ".bank.retrained" in n} == {
+        *("irm.0.bank.retrained.1.5x", "irm.0.bank.retrained-2.1.5x"),
+        "irm.0.bank.retrained-from-the-student.1.5x",
+        "irm.0.bank.retrained-from-the-student-2.1.5x",
+        *("irm.0.bank.retrained.1x", "irm.0.bank.retrained-2.1x"),
+        *("irm.0.bank.retrained.1.25x", "irm.0.bank.retrained-2.1.25x"),
+    }
