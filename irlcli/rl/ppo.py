@@ -21,8 +21,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from irlcli.configs import PPOConfig
 from irlcli.errors import StageFailed
 from irlcli.networks import ACTIVATIONS
-from irlcli.rl.reward_normaliser import RunningDeviation
 from irlcli.rl.policy import NormalisingExtractor, Policy, extractor
+from irlcli.rl.reward_normaliser import RunningDeviation
 from irlcli.rl.worlds import RecordingVecEnv, Worlds
 from irlcli.seeds import derive
 from irlcli.trajectories import Rollout

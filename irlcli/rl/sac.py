@@ -23,9 +23,9 @@ from stable_baselines3.common.logger import Logger
 from irlcli.configs import SACConfig
 from irlcli.errors import StageFailed
 from irlcli.networks import ACTIVATIONS
-from irlcli.rl.reward_normaliser import RunningDeviation
 from irlcli.rl.policy import NormalisingExtractor, Policy, SquashedPolicy, extractor
 from irlcli.rl.ppo import RewardSource
+from irlcli.rl.reward_normaliser import RunningDeviation
 from irlcli.rl.worlds import RecordingVecEnv, Worlds
 from irlcli.seeds import derive
 from irlcli.trajectories import Rollout
