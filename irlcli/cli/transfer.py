@@ -20,8 +20,11 @@ def transfer(
     session: StageSession,
     reward: Annotated[str, typer.Option(help="Learned reward: reward.pt or its artefact.")],
     ood: Annotated[
-        str, typer.Option(help="Setting: VALUE, KNOB=VALUE, or KNOB for its OOD value.")
-    ],
+        str | None, typer.Option(help="Setting: VALUE, KNOB=VALUE, or KNOB for its OOD value.")
+    ] = None,
+    intervention: Annotated[
+        str | None, typer.Option(help="Setting: VALUE, KNOB=VALUE, or KNOB for its ID value.")
+    ] = None,
     algorithm: Annotated[
         str | None,
         typer.Option(
@@ -39,17 +42,29 @@ def transfer(
     seed: Seed = 0,
     name: Name = None,
 ) -> None:
-    """Train a new policy on a frozen reward in an unseen setting."""
+    """Train a new policy on a frozen reward in one setting."""
     if start not in _STARTS:
         raise UsageError(f"unknown --start {start!r}", suggest(start, _STARTS))
+    if (ood is None) == (intervention is None):
+        both = "--ood and --intervention both name a setting"
+        raise UsageError(
+            both if ood is not None else "no setting is named",
+            "give one of --ood SETTING, --intervention SETTING",
+        )
     source, origin = references.tensor_file(session.store, reward, "reward")
     arguments.check_env(reward, origin.env, env)
     config = session.config(origin.env, {"transfer.algorithm": algorithm})
-    settings = arguments.named_settings(origin.env, config, ood, "ood", origin)
+    if intervention is not None:
+        option, text = "--intervention", intervention
+        settings = arguments.named_settings(origin.env, config, text, "id", origin)
+    else:
+        option, text = "--ood", str(ood)
+        settings = arguments.named_settings(origin.env, config, text, "ood", origin)
     if len(settings) != 1:
         names = ", ".join(str(setting) for setting in settings)
         raise UsageError(
-            f"--ood {ood!r} names {len(settings)} settings: {names}", "transfer to one at a time"
+            f"{option} {text!r} names {len(settings)} settings: {names}",
+            "transfer to one at a time",
         )
     label = f"{describe(origin.airl)} seed {origin.seed}"
     request = stage.request(

@@ -138,6 +138,14 @@ def test_a_ceiling_changes_the_policy_and_evaluations_stay_unbounded(runs, irl):
     assert done.code == 0, done.err
 
 
+def test_a_training_setting_is_named_as_for_evaluations(runs, irl):
+    own = ["transfer", "--reward", "airl", *common(runs), "--dry-run"]
+    by_value = irl(*own, "--intervention", "2:0.6:0.6")
+    assert by_value.code == 0, by_value.err
+    assert "half-cheetah friction=2:0.6:0.6" in by_value.out
+    assert by_value.out == irl(*own, "--ood", "friction=2:0.6:0.6").out
+
+
 def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
     lander = ["transfer", "--reward", "airl", "--ood", "1.5x", *common(store_copy.path)]
     own = ["transfer", "--reward", "airl", "--ood", "friction", *common(runs)]
@@ -151,6 +159,13 @@ def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
             "--algorithm ppo",
         ),
         ([*own, "--set", "transfer.ceiling=1.5"], "transfer.ceiling", "none"),
+        ([*own, "--intervention", "friction"], "--ood and --intervention both", "give one of"),
+        ([*own[:3], *common(runs)], "no setting is named", "give one of --ood"),
+        (
+            [*own[:3], "--intervention", "friction", *common(runs)],
+            "names 2 settings: friction=1.5:0.1:0.1, friction=2:0.6:0.6",
+            "one at a time",
+        ),
     ):
         done = irl(*arguments)
         assert done.code == 2 and done.out == ""
