@@ -21,7 +21,7 @@ COMMANDS = {
     "collect-experts": ("collect", "Train an expert per setting and record its demonstrations."),
     "train-airl": ("train", "Learn a reward and a student policy from demonstrations."),
     "train-maxent": ("train", "Learn a reward from demonstrations in a gridworld, exactly."),
-    "transfer": ("transfer", "Train a new policy on a frozen reward in an unseen setting."),
+    "transfer": ("transfer", "Train a new policy on a frozen reward in one setting."),
     "evaluate": ("evaluate", "Measure the return of a policy, an expert or a baseline."),
     "assess": ("assess", "Measure how well a learned reward ranks policies."),
     "play": ("play", "Draw a policy as a GIF, several settings side by side."),
