@@ -135,8 +135,8 @@ def _of_policy(
     if scored_by is not None:
         arguments.check_env(scored_by.ref, scored_by.origin.env, origin.env)
         check_observed(origin.env, scored_by.origin.settings, settings)
-    label = f"expert of {', '.join(origin.settings)}"
-    if origin.agent != "expert":
+    label = f"{origin.agent} of {', '.join(origin.settings)}"
+    if origin.method is not None:
         label = f"{origin.agent} {origin.method} of seed {origin.seed}"
     return stage.request(
         origin.env,

@@ -12,7 +12,7 @@ from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 from irlcli.report.agents import title
 
-_ORDER = ("expert", "student", "transfer", "random", "idle")
+_ORDER = ("expert", "student", "transfer", "clone", "random", "idle")
 _HINT = "a row is a sample over seeds: report runs that differ in anything else separately"
 
 

@@ -148,6 +148,20 @@ def test_the_clone_imitates(assessed):
     assert (chosen == actions).mean() > common
 
 
+def test_the_clone_can_be_evaluated_like_any_policy(assessed, irl):
+    path, document = assessed
+    (made,) = (a for a in Store(path).artefacts() if a.manifest.record.stage == "clone")
+    line = ["evaluate", "--policy", made.id, "--intervention", "engine-power=1x"]
+    done = irl(*line, "--store", path, *SMOKE, "--json")
+    (row,) = json.loads(done.out)["returns"]
+    entries = document["assessment"]["bank"]
+    (entry,) = (e for e in entries if (e["policy"], e["setting"]) == (LADDER[0], "engine-power=1x"))
+    assert row["agent"] == "clone" and row["mean"] == pytest.approx(entry["true"]["mean"])
+    assert (
+        "evaluate clone of engine-power=1x" in irl(*line, "--store", path, *SMOKE, "--dry-run").out
+    )
+
+
 def test_a_reward_without_its_store_has_a_ladder_only_with_demos(smoke_store, irl, tmp_path):
     shutil.copy(smoke_store.path / smoke_store.airl / "reward.pt", tmp_path)
     store = tmp_path / "runs"
