@@ -30,7 +30,9 @@ class Group(NamedTuple):
 def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> list[Group]:
     """The groups of E settings with ``counts`` [E] episodes.
 
-    - ``pooled``: one group, every episode weighted equally (ERM).
+    - ``pooled``: one group, every episode weighted equally (ERM). Each setting has its own part, so
+      that the policy's samples, which are paired with a part's settings, have the same shares.
+      Otherwise a discriminator could learn how often a setting was demonstrated.
     - ``balanced`` and ``per-setting``: one group per setting, of equal weight. Balanced groups
       share one risk where a penalty looks at risks.
     - ``shuffled``: as many groups, over episodes dealt out at random by ``rng``. Each setting keeps
@@ -39,7 +41,8 @@ def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> lis
     settings = range(len(counts))
     everything = {e: np.arange(counts[e]) for e in settings}
     if grouping == "pooled":
-        return [Group((Part(everything, 1.0),), 1.0)]
+        parts = (Part({e: everything[e]}, counts[e] / sum(counts)) for e in settings)
+        return [Group(tuple(parts), 1.0)]
     if grouping in ("balanced", "per-setting"):
         return [Group((Part({e: everything[e]}, 1.0),), 1.0 / len(counts)) for e in settings]
     dealt = deal(counts, rng)

@@ -213,4 +213,4 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("train-airl", 4, run)
+STAGE = Stage("train-airl", 5, run)

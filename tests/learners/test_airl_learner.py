@@ -115,6 +115,19 @@ def test_unequal_counts_weigh_as_the_grouping_says(demos):
         assert learner._weights.tolist() == weights
 
 
+def test_the_policys_samples_are_shared_out_as_the_demonstrations_are(demos):
+    """Otherwise the discriminator could learn how often a setting was demonstrated."""
+    few = [demos[0][:1], demos[1][:3]]
+    trainer, learner = make(few, ppo=LONG, horizon=HORIZON, batch_size=64)
+    pools = [
+        learner._pool(data, None) for data, _ in learner._generated(trainer.train_round(0, learner))
+    ]
+    ((first, second),) = learner._risks(pools, learner._replay, pools, None)
+    assert (first.count, second.count) == (32, 96)
+    for setting, stratum in enumerate((first, second)):
+        assert torch.equal(stratum.policy.observations, pools[setting].observations)
+
+
 def test_a_student_begins_as_a_clone_of_all_experts(demos):
     """Whatever the method, and only if asked for."""
     found = {}
