@@ -230,8 +230,8 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
     """How well each reward ranks a bank of policies, a row per row, method, setting and seed.
 
     Columns: ``row``, ``agent``, ``setting``, ``seed``; ``spearman`` and ``spearman_low`` over the
-    bank and over its lower half; ``expert_minus_idle`` per step; ``return_distance``; ``verdict``
-    on the policy retrained there, missing without one.
+    bank and over its lower half; ``expert_minus_idle`` per step; ``return_distance``; ``verdicts``
+    on the policies retrained there from scratch, one for each retraining.
     """
 
     def value(found: Interval | None) -> float | None:
@@ -247,7 +247,7 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
             "spearman_low": value(s.lower_half.spearman),
             "expert_minus_idle": s.expert_minus_idle and s.expert_minus_idle.mean,
             "return_distance": s.return_distance,
-            "verdict": s.retrained[0].verdict if s.retrained else None,
+            "verdicts": [r.verdict for r in s.retrained if "student" not in r.policy],
         }
         for row in p.rows
         for method in p.methods
@@ -256,7 +256,7 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
         for s in assessments[row.name, method, seed].settings
     ]
     columns = ["row", "agent", "setting", "seed", "spearman", "spearman_low", "expert_minus_idle"]
-    return pd.DataFrame(found, columns=[*columns, "return_distance", "verdict"])
+    return pd.DataFrame(found, columns=[*columns, "return_distance", "verdicts"])
 
 
 def _verdict(seed: Any, random: float) -> Verdict:

@@ -52,7 +52,7 @@ _QUALITY_NOTE = (
     "of the demonstrations, student, experts, retrained policy): Spearman's correlation of learned "
     "with true return, over the bank and over the half with the lower true returns, median over seeds "
     "(least to largest). Expert - idle: learned reward per step, in standard deviations of g, median "
-    "over seeds. The last three count the seeds' retrained policies by verdict: retrained, if the "
+    "over seeds. The last three count the policies retrained from scratch by verdict: retrained, if the "
     "regret is within 10 % of what the expert earns above the random agent; else wrong reward, if the "
     "policy's learned return is at least the expert's; else optimisation fell short."
 )
@@ -227,8 +227,7 @@ def reward_quality(found: pd.DataFrame) -> Table:
     """The rewards' assessments, a line per row, method and setting."""
     lines = []
     for (row, method, setting), seeds in found.groupby(["row", "agent", "setting"], sort=False):
-        counts = seeds["verdict"].value_counts()
-        judged = int(counts.sum())
+        verdicts = [verdict for of_seed in seeds["verdicts"] for verdict in of_seed]
         lines.append(
             [
                 row,
@@ -238,7 +237,10 @@ def reward_quality(found: pd.DataFrame) -> Table:
                 _spread(seeds["spearman"]),
                 _spread(seeds["spearman_low"]),
                 number(seeds["expert_minus_idle"].astype(float).median(), 2),
-                *(f"{counts.get(v, 0)}/{judged}" if judged else "" for v in get_args(Verdict)),
+                *(
+                    f"{verdicts.count(v)}/{len(verdicts)}" if verdicts else ""
+                    for v in get_args(Verdict)
+                ),
             ]
         )
     columns = ["row", "setting", "method", "seeds", "Spearman", "lower half", "expert - idle"]
