@@ -102,11 +102,14 @@ class StageSession(Session):
         self.workers = workers
         self.tensorboard = tensorboard
 
-    def config(self, env: str, flags: Mapping[str, Any] | None = None) -> "Config":
-        """The config of ``env`` under this session's profile and overrides."""
+    def config(
+        self, env: str, flags: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
+    ) -> "Config":
+        """The config of ``env`` under this session's profile and overrides, then ``overrides``."""
         from irlcli.configs import load_config
 
-        return load_config(env, self.profile, self.file or self.table_file, self.overrides, flags)
+        file = self.file or self.table_file
+        return load_config(env, self.profile, file, [*self.overrides, *overrides], flags)
 
     def config_words(self) -> list[str]:
         """The options that give another command line the same configs."""

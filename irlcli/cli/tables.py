@@ -67,7 +67,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
     candidates: Sequence[float] = ()
     if choice.choose_penalty is not None:
-        if table.kind != "comparison":
+        if table.kind != "comparison" or table.variants:
             raise UsageError(f"{table.name} takes no --choose-penalty", "omit --choose-penalty")
         candidates = arguments.weights(choice.choose_penalty)
     tag = choice.tag or (table.name if table.settings else session.profile)

@@ -131,6 +131,28 @@ def _of_knob(
     return msgspec.convert(tree, kind)
 
 
+def overridden(items: Sequence[str]) -> dict[str, Any]:
+    """The fields that ``items`` change, each as for ``--set``, and their typed values.
+
+    Raises:
+        UsageError: an unknown field, a value that is not of its field's type or in no registry, or
+            a field that appears twice.
+    """
+    tree: dict[str, Any] = {}
+    values: dict[str, Any] = {}
+    for item in items:
+        dotted = item.partition("=")[0].strip()
+        nested = _override(item)
+        if dotted in values:
+            raise UsageError(f"{dotted} appears twice", "name each field once")
+        tree = _merge(tree, nested)
+        for name in dotted.split("."):
+            nested = nested[name]
+        values[dotted] = nested
+    check_registered(msgspec.convert(tree, Config))
+    return values
+
+
 def settings_directory() -> Path:
     """``settings/`` of the checkout, or its copy inside an installed package."""
     packaged = Path(__file__).parent.parent / "settings_files"

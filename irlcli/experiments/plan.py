@@ -10,9 +10,10 @@ import msgspec
 from irlcli.configs import Config
 from irlcli.errors import UsageError, closest
 from irlcli.experiments import rows
-from irlcli.experiments.rows import PHASES, Chosen, Configs, Task
+from irlcli.experiments.rows import PHASES, Chosen, Run, Task
 from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
+from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
 from irlcli.stages.base import From, Request
 from irlcli.store import digest
 
@@ -46,11 +47,13 @@ class Plan:
         UsageError: a setting that a row needs is missing, or ``only`` names no step.
     """
 
-    def __init__(self, table: Table, selection: Selection, configs: Configs, lookup: Lookup):
+    def __init__(self, table: Table, selection: Selection, load: Overridable, lookup: Lookup):
         self.table = table
         self.selection = selection
         self.lookup = lookup
-        self._configs = _cached(configs)
+        self._load = load
+        self._configs = _cached(lambda env, flags: load(env, flags, ()))
+        self._under = {v: _cached(configs_of(v, load)) for v in table.variants}
         self.figure: Request | None = None
         self.tasks: dict[str, Task] = {}
         self.needs: dict[str, tuple[str, ...]] = {}
@@ -104,13 +107,20 @@ class Plan:
                 Chosen(self.selection.candidates, self.lookup),
             )
 
-    def _runs(self, row: Row) -> list[tuple[str, int]]:
-        return [
-            (method, seed)
-            for method in self.table.methods
-            for seed in self.table.seeds
-            if self._may_hold(f"{row}.{method}.{seed}.")
+    def _runs(self, row: Row) -> list[Run]:
+        """The row's rewards; that alone which the selected step is about, if it is about one."""
+        methods, seeds = self.table.methods, self.table.seeds
+        runs = [
+            Run(variant.name, method, seed, f"{row}.{step_name(variant)}", self._under[variant])
+            for variant in self.table.variants
+            for method in methods
+            for seed in seeds
+        ] or [
+            Run(method, method, seed, str(row), self._configs)
+            for method in methods
+            for seed in seeds
         ]
+        return [run for run in runs if self._may_hold(f"{run.name}.")] or runs
 
     def _may_hold(self, prefix: str) -> bool:
         """Whether the selected steps may be among those whose names begin with ``prefix``."""
@@ -120,7 +130,7 @@ class Plan:
     def _keep_only(self, only: str) -> None:
         if only not in self.tasks:
             everything = Plan(
-                self.table, self.selection._replace(only=None), self._configs, self.lookup
+                self.table, self.selection._replace(only=None), self._load, self.lookup
             )
             close = closest(only, everything.tasks)
             hint = f"did you mean {close!r}? " if close else ""

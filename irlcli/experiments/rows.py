@@ -10,21 +10,22 @@ A task's name is that of its row and what it makes::
     ROW.METHOD.SEED.from-student  ....from-student-returns
     ROW.METHOD.SEED.transfer-id.VALUE  ....transfer-id.VALUE-returns
     ROW.METHOD.SEED.transfer.1  ....transfer.1-returns  ...      further retrainings
+    ROW.VARIANT.METHOD.SEED...                                   of tables with variants
     ROW.METHOD.SEED.choice                                       lambda, with --choose-penalty
     ROW.clone  ROW.bank.POLICY.VALUE  ROW.METHOD.SEED.bank.POLICY.VALUE  ROW.METHOD.SEED.assess
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 
-from irlcli.configs import Config
 from irlcli.errors import UsageError
 from irlcli.experiments.bank import Policies, Retrained, bank
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
+from irlcli.experiments.variants import Configs
 from irlcli.interventions import Setting, parse_settings
 from irlcli.methods import fields
 from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
@@ -48,8 +49,6 @@ PHASES: tuple[Phase, ...] = get_args(Phase)
 # A reward's first policy is retrained with the reward's own seed, the next ones with seeds that no
 # other reward uses.
 _NEXT_RETRAINING = 1000
-# The config of an environment, under flags such as ``airl.penalty``.
-Configs = Callable[[str, Mapping[str, Any] | None], Config]
 
 
 class Task(NamedTuple):
@@ -66,6 +65,27 @@ class Task(NamedTuple):
     request: Request
     cell: Cell | None = None
     curves: Mapping[str, Request] = {}
+
+
+class Run(NamedTuple):
+    """One reward of a row, and all that is made with it.
+
+    Attributes:
+        agent: the method or the variant, as the report's cells call it.
+        shared: what the names of the steps begin with that other seeds have as well.
+        configs: those of the variant.
+    """
+
+    agent: str
+    method: str
+    seed: int
+    shared: str
+    configs: Configs
+
+    @property
+    def name(self) -> str:
+        """What the names of its steps begin with."""
+        return f"{self.shared}.{self.method}.{self.seed}"
 
 
 class Chosen(NamedTuple):
@@ -150,16 +170,17 @@ def comparison(
     row: Row,
     measures: Sequence[str],
     retrainings: int,
-    runs: Sequence[tuple[str, int]],
+    runs: Sequence[Run],
     configs: Configs,
     chosen: Chosen,
 ) -> Iterator[Task]:
-    """The tasks of a row that compares ``runs`` of (method, seed); each after what it needs.
+    """The tasks of a row that compares ``runs``; each after what it needs.
 
     Each reward is retrained ``retrainings`` times.
 
     Raises:
-        UsageError: the settings list no values of the knob, or not one unseen one.
+        UsageError: the settings list no values of the knob, or not one unseen one; or a config is
+            contradictory.
     """
     requests = _RowRequests(row, configs)
     trained, unseen = requests.trained, requests.unseen
@@ -190,24 +211,30 @@ def comparison(
                 request = requests.returns(places, expert, policy_label=label)
                 cell = requests.cell("reused", measure, place=str(e))
                 yield Task(name, "returns", request, cell)
-    for name, seed in runs:
-        yield from _run(requests, demos, name, seed, measures, retrainings, configs, chosen)
+    under = {configs: requests}
+    for run in runs:
+        try:
+            if run.configs not in under:
+                under[run.configs] = _RowRequests(row, run.configs)
+            yield from _run(under[run.configs], demos, run, measures, retrainings, chosen)
+        except UsageError as error:
+            if run.agent == run.method:
+                raise
+            raise UsageError(f"variant {run.agent!r}: {error.message}", error.hint) from None
 
 
 def _run(
     requests: _RowRequests,
     demos: Request,
-    method_name: str,
-    seed: int,
+    run: Run,
     measures: Sequence[str],
     retrainings: int,
-    configs: Configs,
     chosen: Chosen,
 ) -> Iterator[Task]:
-    """One method with one seed: the reward, and what its policies earn."""
+    """One method or variant with one seed: the reward, and what its policies earn."""
     env, unseen, trained = requests.row.env, requests.unseen, requests.trained
-    name = f"{requests.row}.{method_name}.{seed}"
-    airl, basis = configs(env, fields(method_name, "airl")).airl, {}
+    name, agent, seed = run.name, run.agent, run.seed
+    airl, basis = run.configs(env, fields(run.method, "airl")).airl, {}
     if chosen.candidates and airl.penalty != "none":
         choice = choose_penalty.request(
             From(demos),
@@ -226,16 +253,16 @@ def _run(
     learned = train_airl.request(From(demos), env, trained, airl, seed, basis)
     yield Task(name, "rewards", learned)
     learner = f"{train_airl.describe(learned.parameters.airl)} seed {seed}"
-    student = f"student {method_name} of seed {seed}"
+    student = f"student {agent} of seed {seed}"
+    curves = {"reward-learning": learned}
     if "zero-shot" in measures:
-        cell = requests.cell(method_name, "zero-shot", seed)
+        cell = requests.cell(agent, "zero-shot", seed)
         request = requests.returns(unseen, learned, policy_label=student)
-        curves = {"reward-learning": learned}
         yield Task(f"{name}.zero-shot-returns", "returns", request, cell, curves)
     if "id" in measures:
-        cell = requests.cell(method_name, "id", seed)
+        cell = requests.cell(agent, "id", seed)
         request = requests.returns(trained, learned, policy_label=student)
-        yield Task(f"{name}.id-returns", "returns", request, cell)
+        yield Task(f"{name}.id-returns", "returns", request, cell, curves)
     retrained: dict[str, list[Retrained]] = {}
     for measure in RETRAINED:
         if measure in measures:
@@ -243,21 +270,21 @@ def _run(
                 for place in trained if measure == "transfer-id" else unseen:
                     moved = _retraining(requests, learned, seed, measure, place, retraining)
                     where = str(place) if measure == "transfer-id" else ""
-                    cell = requests.cell(method_name, measure, seed, where, retraining=retraining)
-                    yield from _retrained(requests, learned, moved, cell, place)
+                    cell = requests.cell(agent, measure, seed, where, retraining=retraining)
+                    yield from _retrained(requests, learned, moved, cell, place, name)
                     ceiling = moved.parameters.transfer.ceiling
                     known_as = _known_as(measure, retraining)
                     member = Retrained(known_as, From(moved, "policy.pt"), ceiling)
                     retrained.setdefault(str(place), []).append(member)
     if "transfer" in measures:
-        cell = requests.cell(method_name, EXPERT_BY_REWARD, seed, str(unseen[0]))
+        cell = requests.cell(agent, EXPERT_BY_REWARD, seed, str(unseen[0]))
         expert, label = requests.expert(unseen[0]), f"expert of {unseen[0]}"
         request = requests.returns(
             unseen, expert, reward=learned, policy_label=label, reward_label=learner
         )
         yield Task(f"{name}.expert-by-reward", "returns", request, cell)
     if ASSESS in measures:
-        yield from _assessment(requests, demos, learned, retrained, method_name, seed)
+        yield from _assessment(requests, demos, learned, retrained, run)
 
 
 def _assessment(
@@ -265,14 +292,13 @@ def _assessment(
     demos: Request,
     learned: Request,
     retrained: Mapping[str, Sequence[Retrained]],
-    method_name: str,
-    seed: int,
+    run: Run,
 ) -> Iterator[Task]:
     """The bank of a row's policies, and how well the reward of ``learned`` ranks them."""
     row, trained, unseen = requests.row, requests.trained, requests.unseen
     places = [*trained, *unseen]
     imitation = clone.request(From(demos), row.env, trained, requests.config)
-    yield Task(f"{row}.clone", "returns", imitation)
+    yield Task(f"{run.shared}.clone", "returns", imitation)
     experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}
     policies = Policies(
         clone=From(imitation, "policy.pt"),
@@ -283,14 +309,14 @@ def _assessment(
     )
     members = bank(row.env, places, requests.config, policies)
     for entry, recorded in members.items():
-        owner = f"{row}.{method_name}.{seed}" if entry.kind in ("student", "retrained") else row
+        owner = run.name if entry.kind in ("student", "retrained") else run.shared
         policy = re.sub(r"[^A-Za-z0-9.]+", "-", entry.policy.replace(f"{row.knob}=", ""))
         place = entry.setting.partition("=")[2].replace(":", "_")
         yield Task(f"{owner}.bank.{policy}.{place}", "returns", recorded)
-    label = f"{train_airl.describe(learned.parameters.airl)} seed {seed}"
+    label = f"{train_airl.describe(learned.parameters.airl)} seed {run.seed}"
     request = assess.request(From(learned, "reward.pt"), row.env, members, label)
-    cell = requests.cell(method_name, ASSESS, seed)
-    yield Task(f"{row}.{method_name}.{seed}.assess", "returns", request, cell)
+    cell = requests.cell(run.agent, ASSESS, run.seed)
+    yield Task(f"{run.name}.assess", "returns", request, cell)
 
 
 def _known_as(measure: str, retraining: int) -> str:
@@ -320,10 +346,15 @@ def _retraining(
 
 
 def _retrained(
-    requests: _RowRequests, learned: Request, moved: Request, cell: Cell, place: Setting
+    requests: _RowRequests,
+    learned: Request,
+    moved: Request,
+    cell: Cell,
+    place: Setting,
+    reward: str,
 ) -> Iterator[Task]:
     """The policy of ``moved``, and what it earns in ``place``, by the reward too."""
-    name = f"{requests.row}.{cell.agent}.{cell.seed}.{cell.measure}"
+    name = f"{reward}.{cell.measure}"
     name += f".{_value(place)}" if cell.place else ""
     name += f".{cell.retraining}" if cell.retraining else ""
     yield Task(name, "transfers", moved)

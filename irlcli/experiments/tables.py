@@ -10,8 +10,10 @@ import msgspec
 from irlcli.configs.load import load_config, read_toml, settings_directory
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError, closest, suggest
+from irlcli.experiments.variants import read_variants
 from irlcli.interventions import knob_of
 from irlcli.methods import METHODS
+from irlcli.report.parameters import Variant
 
 Kind = Literal["comparison", "experts", "figure2"]
 Measure = Literal["transfer", "from-student", "zero-shot", "transfer-id", "id", "assess"]
@@ -39,6 +41,8 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
             of them for the other kinds: ``experts`` has a row for every intervention in
             ``settings/``, ``figure2`` is about the gridworld.
         retrainings: of each reward, for every measure of a retrained policy.
+        variants: of the config; the table then compares them instead of methods, and has one
+            method. The others are compared with the first, which a file names as ``base``.
         settings: a TOML file laid over the profile.
     """
 
@@ -50,7 +54,13 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...] = ()
     measures: tuple[Measure, ...] = ()
     retrainings: int = 1
+    variants: tuple[Variant, ...] = ()
     settings: Path | None = None
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """The names of what the table compares: its variants, or its methods."""
+        return tuple(variant.name for variant in self.variants) or self.methods
 
 
 def default_file() -> Path:
@@ -114,6 +124,8 @@ def narrowed(
     changes: dict[str, Any] = {}
     if methods is not None:
         _check_list("--methods", methods, METHODS)
+        if table.variants:
+            _check_single("--methods", methods)
         changes["methods"] = tuple(methods)
     if seeds is not None:
         _check_list("--seeds", seeds)
@@ -144,7 +156,7 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
             f"{name!r} cannot be the name of a table",
             "a lowercase letter, then up to 30 lowercase letters, digits and '-'",
         )
-    fields = [f for f in Table.__struct_fields__ if f != "name"]
+    fields = [*(f for f in Table.__struct_fields__ if f != "name"), "base"]
     _check_fields(value, name, fields)
     kind = _one_of(f"{name}.kind", value.get("kind", "comparison"), get_args(Kind))
     title = _text(f"{name}.title", value.get("title", name))
@@ -157,7 +169,7 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
             )
     comparing = ("rows", "methods", "seeds", "measures")
     if kind != "comparison":
-        for field in (*comparing, "retrainings"):
+        for field in (*comparing, "retrainings", "variants", "base"):
             if field in value:
                 raise UsageError(f"{name}.{field}: kind {kind!r} has no {field}", f"omit {field}")
         return Table(name=name, title=title, kind=kind, settings=settings)
@@ -184,6 +196,17 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
         raise UsageError(
             f"{name}.retrainings: {retrainings!r} is not a count", "a whole number from 1"
         )
+    variants: tuple[Variant, ...] = ()
+    if "variants" in filled:
+        variants = read_variants(f"{name}.variants", filled["variants"], filled.get("base"))
+        _check_single(f"{name}.methods", filled["methods"])
+        if "transfer-id" not in filled["measures"]:
+            raise UsageError(
+                f"{name}.measures: variants are compared by policies retrained in distribution",
+                "add transfer-id",
+            )
+    elif "base" in filled:
+        raise UsageError(f"{name}.base: {name} has no variants", "omit base")
     return Table(
         name=name,
         title=title,
@@ -193,6 +216,7 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
         seeds=tuple(filled["seeds"]),
         measures=tuple(filled["measures"]),
         retrainings=retrainings,
+        variants=variants,
         settings=settings,
     )
 
@@ -239,6 +263,11 @@ def _check_list(field: str, values: Sequence[Any], known: Mapping | Sequence | N
             _one_of(field, value, list(known))
         if value in values[:i]:
             raise UsageError(f"{field}: {value} appears twice", "name each once")
+
+
+def _check_single(field: str, methods: Sequence[str]) -> None:
+    if len(methods) > 1:
+        raise UsageError(f"{field}: variants are compared within one method", "name one method")
 
 
 def _one_of(field: str, value: Any, known: Sequence[str]) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from irlcli.report import caveats, compute, result_tables, retrained
+from irlcli.report import ablation, caveats, compute, result_tables, retrained
 from irlcli.report.parameters import Parameters
 from irlcli.report.tables import Table
 
@@ -25,6 +25,8 @@ class Report:
         against_zero_shot: see :func:`irlcli.report.retrained.against_zero_shot`.
         learned_returns: see :func:`irlcli.report.compute.learned_returns`.
         discriminators: see :func:`irlcli.report.compute.discriminator_ends`.
+        shares, variants: see :func:`irlcli.report.ablation.shares` and
+            :func:`irlcli.report.ablation.summarise_variants`; empty without variants.
         reward_quality: see :func:`irlcli.report.compute.reward_quality`.
         tables: the same for people.
         caveats: what a reader must know before drawing conclusions.
@@ -38,6 +40,8 @@ class Report:
     learned_returns: pd.DataFrame
     discriminators: pd.DataFrame
     reward_quality: pd.DataFrame
+    shares: pd.DataFrame
+    variants: pd.DataFrame
     tables: list[Table]
     caveats: list[str]
 
@@ -65,7 +69,10 @@ def build(
     learned_returns = compute.learned_returns(p, points)
     discriminators = compute.discriminator_ends(p, learning)
     quality = compute.reward_quality(p, assessments)
+    shares = ablation.shares(p, points) if p.variants else pd.DataFrame()
+    variants = ablation.summarise_variants(p, shares) if p.variants else pd.DataFrame()
     tables = [
+        *(ablation.tables(p, shares, variants) if p.variants else ()),
         *result_tables.measures(p, cells, comparisons),
         result_tables.by_training_setting(by_training_setting),
         result_tables.against_zero_shot(against_zero_shot),
@@ -83,6 +90,7 @@ def build(
         *caveats.short_of_expert(learned_returns),
         *caveats.saturated(discriminators),
         *caveats.identical(episodes),
+        *ablation.without_effect(p),
         *caveats.without_p(comparisons),
         *caveats.shared_demonstrations(p),
         *caveats.left_out(p),
@@ -98,6 +106,8 @@ def build(
         learned_returns,
         discriminators,
         quality,
+        shares,
+        variants,
         tables,
         found,
     )
@@ -118,6 +128,8 @@ def as_json(report: Report) -> dict[str, Any]:
         "learned_returns": records(report.learned_returns),
         "discriminators": records(report.discriminators),
         "reward_quality": records(report.reward_quality),
+        "shares": records(report.shares),
+        "variants": records(report.variants),
         "points": records(report.points),
         "tables": [table._asdict() for table in report.tables],
         "caveats": report.caveats,

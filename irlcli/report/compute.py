@@ -161,11 +161,12 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     beats one of y; ``not_imitated``, which of the two failed in distribution; ``why``, the reason
     for a missing Welch test.
     """
+    pairs = [(v.name, p.variants[0].name) for v in p.variants[1:]] or comparisons(p.methods)
     students = cells[(cells["measure"] == "id") & cells["agent"].isin(p.methods)]
     failed = {(r.row, r.agent) for r in students.itertuples() if failed_to_imitate(r)}
     found = []
     for measure in p.measures:
-        for x, y in comparisons(p.methods):
+        for x, y in pairs:
             samples = [
                 [sample(points, row.name, agent, measure)["true_return"] for agent in (x, y)]
                 for row in p.rows

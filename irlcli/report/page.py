@@ -13,6 +13,10 @@ from irlcli.report.parameters import Parameters
 from irlcli.report.tables import Table, latex_table, markdown_table
 from irlcli.report.text import number
 
+_RETURNS = "Every seed, the mean and its 95 % bootstrap interval."
+_SHARES = "Every seed and the mean, as a share of the experts; the lines are the gates."
+_VARIANT_FILES = "`variants.csv`: a row per variant. `shares.csv`: shares of the experts, by seed. "
+
 
 def latex(report: Report) -> str:
     """Every table; the caveats are comments."""
@@ -37,9 +41,9 @@ def markdown(p: Parameters, report: Report) -> str:
     parts.append("## Files\n")
     parts.append(
         f"`{p.kind}.csv`: a row per cell. `seeds.csv`: a row per seed and setting. `comparisons.csv`: a "
-        f"row per comparison. `{p.kind}.json`: all numbers. `{p.kind}.html`: all of this with learning "
+        f"row per comparison. {_VARIANT_FILES * bool(p.variants)}`{p.kind}.json`: all numbers. `{p.kind}.html`: all of this with learning "
         f"curves and lineage on one page. `{p.kind}.tex`: needs booktabs and longtable. `{p.kind}.png`, "
-        "`.pdf`: every seed, the mean, its 95 % interval.\n"
+        f"`.pdf`: {(_SHARES if p.variants else _RETURNS).lower()}\n"
     )
     return "\n".join(parts)
 
@@ -95,6 +99,7 @@ def html(
         points: SVG of every seed's point.
         banks, curves: SVGs by title.
     """
+    first = len(p.rows) if p.variants else len(p.measures)
     sections = [
         (
             "Caveats",
@@ -102,9 +107,9 @@ def html(
             if report.caveats
             else "<p>None: no run is missing, mixed or left out.</p>",
         ),
-        *((t.title, _html_table(t)) for t in report.tables[: len(p.measures)]),
-        ("Every seed", _figure("Every seed, the mean and its 95 % bootstrap interval.", points)),
-        *((t.title, _html_table(t)) for t in report.tables[len(p.measures) :]),
+        *((t.title, _html_table(t)) for t in report.tables[:first]),
+        ("Every seed", _figure(_SHARES if p.variants else _RETURNS, points)),
+        *((t.title, _html_table(t)) for t in report.tables[first:]),
         *(
             [("Learned against true return", "".join(_figure(t, svg) for t, svg in banks.items()))]
             if banks

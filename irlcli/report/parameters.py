@@ -50,6 +50,13 @@ class Cell(msgspec.Struct, frozen=True):
         return f"{text} retraining {self.retraining}" if self.retraining else text
 
 
+class Variant(msgspec.Struct, frozen=True):
+    """A named set of overrides such as ``transfer.ceiling=none``."""
+
+    name: str
+    overrides: tuple[str, ...] = ()
+
+
 class Row(msgspec.Struct, frozen=True, kw_only=True):
     """One environment and knob.
 
@@ -119,6 +126,9 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
         kind: of report, such as ``table1``.
         command: the command line that produces this report; printed in it.
         measures: keys of :data:`irlcli.report.agents.MEASURES`.
+        methods: what is compared; the names of the variants where there are variants.
+        variants: of the config, that with which the others are compared first.
+        learned_by: the method of all variants; empty without variants.
         retrainings: policies trained on each reward.
         runs: provenance of the artefacts, by id.
         libraries: the sets of library versions that occur, by a short name.
@@ -130,6 +140,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     measures: tuple[str, ...]
     rows: tuple[Row, ...]
     methods: tuple[str, ...]
+    variants: tuple[Variant, ...] = ()
+    learned_by: str = ""
     seeds: tuple[int, ...]
     retrainings: int = 1
     cells: tuple[Cell, ...]

@@ -16,6 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
+from irlcli.report import ablation
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, colours, title
 from irlcli.report.build import Report
 from irlcli.report.compute import sample
@@ -74,12 +75,16 @@ def as_svg(figure: plt.Figure, name: str) -> str:
 def draw_points(directory: Path, p: Parameters, report: Report) -> str:
     """Write ``KIND.png`` and ``KIND.pdf``: every seed, the mean and its interval. Return the SVG."""
     with style("black"):
-        figure = _points(p, report)
+        figure = _figure(p, report)
         figure.savefig(directory / f"{p.kind}.png", dpi=130)
         figure.savefig(directory / f"{p.kind}.pdf", metadata={"CreationDate": None})
         plt.close(figure)
     with style(INK):
-        return as_svg(_points(p, report), "points")
+        return as_svg(_figure(p, report), "points")
+
+
+def _figure(p: Parameters, report: Report) -> plt.Figure:
+    return ablation.figure(p, report.shares) if p.variants else _points(p, report)
 
 
 def _points(p: Parameters, report: Report) -> plt.Figure:

@@ -16,7 +16,7 @@ def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
 
     The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. Outputs
     ``README.md``, ``KIND.csv`` (a row per cell), ``seeds.csv`` (a row per seed and setting),
-    ``comparisons.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``; for each row
+    ``comparisons.csv``, with variants ``variants.csv`` and ``shares.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``; for each row
     with an assessed reward ``bank-ENV-KNOB.png``.
     """
     return Request(STAGE, parameters, dict(sources), f"report {parameters.kind}")
@@ -34,6 +34,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     points: list[dict[str, Any]] = []
     assessments = {}
+    shared: set[tuple[str, str]] = set()
     episodes: dict[tuple[str, str], dict[tuple[str, str], Any]] = {}
     for cell in p.cells:
         if not cell.run:
@@ -70,7 +71,10 @@ def run(job: Job) -> None:
             which = f"{cell.seed}"
             which += f" in {cell.place}" if cell.place else ""
             which += f" retraining {cell.retraining}" if cell.retraining else ""
-            group[cell.agent, which] = returns["true_return"].to_numpy()
+            # Variants share whole runs by design; only different runs can be suspiciously equal.
+            if not p.variants or (cell.row, cell.run) not in shared:
+                group[cell.agent, which] = returns["true_return"].to_numpy()
+            shared.add((cell.row, cell.run))
     learning = {
         role: pd.read_parquet(path)
         for role, path in job.inputs.items()
@@ -87,6 +91,9 @@ def run(job: Job) -> None:
     write_csv(job.output / f"{p.kind}.csv", report.cells)
     write_csv(job.output / "seeds.csv", report.points)
     write_csv(job.output / "comparisons.csv", report.comparisons)
+    if p.variants:
+        write_csv(job.output / "variants.csv", report.variants)
+        write_csv(job.output / "shares.csv", report.shares)
     write_json(job.output / f"{p.kind}.json", build.as_json(report))
     (job.output / "README.md").write_text(page.markdown(p, report))
     (job.output / f"{p.kind}.tex").write_text(page.latex(report))
@@ -96,4 +103,4 @@ def run(job: Job) -> None:
     (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, banks, curves))
 
 
-STAGE = Stage("report", 11, run)
+STAGE = Stage("report", 12, run)

@@ -1,0 +1,216 @@
+"""Variants of the config side by side: which part of reward learning makes a reward retrainable.
+
+Points are those of :mod:`irlcli.report.compute`; the variants stand where methods stand elsewhere.
+"""
+
+from __future__ import annotations
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+
+from irlcli.report.agents import colours, title
+from irlcli.report.parameters import Parameters, Row
+from irlcli.report.statistics import holm, paired_p, summarise
+from irlcli.report.tables import Table
+from irlcli.report.text import number, p_value, percent
+
+# Shares of the expert's return that a retrained policy is asked to reach.
+GATES = (0.8, 0.9)
+_RETRAINED, _STUDENT = "transfer-id", "id"
+_NOTE = (
+    "{method}. True return in the settings trained on, as a share of that setting's own expert: mean ± standard "
+    "deviation over seeds of the reward learning, then each seed. Retrained: policies trained from "
+    "scratch on the frozen reward; all settings: their mean, of seeds that have all of them. Student: "
+    "the policy trained while the reward was learned. Progress: the retrained policies' share of the "
+    "experts' progress. Difference: of the retrained policies' shares to those of {base}, in "
+    "percentage points, over the seeds that both have (their number in brackets). p: paired t-test on "
+    "these seeds, two-sided; Holm: adjusted over the variants that have a p-value."
+)
+
+
+def shares(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
+    """What policies earn of their setting's expert, a row per row, variant, measure, setting, seed.
+
+    Columns: ``row``, ``agent``, ``measure`` (``transfer-id`` or ``id``), ``setting``, ``seed``;
+    ``share`` of the expert's true return and ``progress_share`` of its progress, each the mean of
+    its retrainings, missing unless the expert's is positive.
+    """
+    own = points[(points["agent"] == "expert") & (points["measure"] == "id")]
+    columns = ["true_return", "progress"]
+    experts = own.set_index(["row", "setting"])[columns].astype(float)
+    measured = points[
+        points["agent"].isin(p.methods) & points["measure"].isin((_RETRAINED, _STUDENT))
+    ]
+    keys = ["row", "agent", "measure", "setting", "seed"]
+    earned = measured.astype({"seed": int, "true_return": float, "progress": float})
+    means = earned.groupby(keys, sort=False)[columns].mean().reset_index()
+    both = means.join(experts.where(experts > 0), on=["row", "setting"], rsuffix="_expert")
+    return both[keys].assign(
+        share=both["true_return"] / both["true_return_expert"],
+        progress_share=both["progress"] / both["progress_expert"],
+    )
+
+
+def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
+    """The variants' retrained policies and students, a row per row and variant.
+
+    Columns: ``row``, ``agent``, ``overrides``; ``seeds`` retrained in all training settings,
+    ``mean`` and ``deviation`` (n - 1) over them of the mean share over settings, ``progress``, that
+    of the progress; ``passed_80`` and ``passed_90``, the seeds that reach a gate; ``student``, the
+    mean share of the students; ``difference`` to the first variant over the ``pairs`` seeds that
+    both have, its ``p_paired`` and ``p_paired_holm`` over the row's variants.
+
+    Args:
+        found: see :func:`shares`.
+    """
+    rows = []
+    for row in p.rows:
+        retrained = {v.name: over_settings(found, row, v.name, _RETRAINED) for v in p.variants}
+        base = retrained[p.variants[0].name]
+        lines = []
+        for variant in p.variants:
+            values = retrained[variant.name]
+            s = summarise(values.tolist())
+            common = values.index.intersection(base.index)
+            compared = variant != p.variants[0] and len(common) > 0
+            student = over_settings(found, row, variant.name, _STUDENT)
+            progress = over_settings(found, row, variant.name, _RETRAINED, "progress_share")
+            lines.append(
+                {
+                    "row": row.name,
+                    "agent": variant.name,
+                    "overrides": " ".join(variant.overrides),
+                    "seeds": s.n,
+                    "mean": s.mean,
+                    "deviation": s.deviation,
+                    **{f"passed_{gate:.0%}"[:-1]: int((values >= gate).sum()) for gate in GATES},
+                    "progress": progress.mean(),
+                    "student": student.mean(),
+                    "difference": (values[common] - base[common]).mean() if compared else None,
+                    "pairs": len(common) if compared else 0,
+                    "p_paired": paired_p(values[common].tolist(), base[common].tolist())
+                    if compared
+                    else None,
+                }
+            )
+        adjusted = holm([line["p_paired"] for line in lines])
+        rows += [{**li, "p_paired_holm": p} for li, p in zip(lines, adjusted, strict=True)]
+    return pd.DataFrame(rows)
+
+
+def over_settings(
+    found: pd.DataFrame, row: Row, variant: str, measure: str, column: str = "share"
+) -> pd.Series:
+    """The mean share over ``row``'s training settings by seed, of seeds that have all of them."""
+    chosen = found[
+        (found["row"] == row.name) & (found["agent"] == variant) & (found["measure"] == measure)
+    ]
+    by_seed = chosen.pivot(index="seed", columns="setting", values=column)
+    return by_seed.reindex(columns=list(row.trained)).dropna().mean(axis=1)
+
+
+def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Table]:
+    """A table per row with a line per variant."""
+    note = _NOTE.format(base=p.variants[0].name, method=title(p.learned_by))
+    result = []
+    for row in p.rows:
+        lines = [
+            [
+                r.agent,
+                r.overrides or "as in settings/",
+                *(_setting(found, row, r.agent, setting) for setting in row.trained),
+                _spread(over_settings(found, row, r.agent, _RETRAINED)),
+                f"{r.passed_80}/{r.seeds}, {r.passed_90}/{r.seeds}" if r.seeds else "-",
+                percent(r.progress),
+                _spread(over_settings(found, row, r.agent, _STUDENT)),
+                f"{100 * r.difference:+.1f} ({r.pairs})" if r.pairs else "-",
+                p_value(r.p_paired),
+                p_value(r.p_paired_holm),
+            ]
+            for r in summary[summary["row"] == row.name].itertuples()
+        ]
+        columns = ["variant", "changes", *row.trained, "all settings"]
+        columns += [" and ".join(f"{gate:.0%}" for gate in GATES) + " reached"]
+        columns += ["progress", "student", "difference", "p", "Holm"]
+        result.append(Table(f"Retrained in distribution: {row.name}", note, columns, lines, 2))
+        note = ""
+    return result
+
+
+def _setting(found: pd.DataFrame, row: Row, variant: str, setting: str) -> str:
+    chosen = found[
+        (found["row"] == row.name)
+        & (found["agent"] == variant)
+        & (found["measure"] == _RETRAINED)
+        & (found["setting"] == setting)
+    ]
+    return _spread(chosen.set_index("seed")["share"].sort_index().dropna())
+
+
+def _spread(values: pd.Series) -> str:
+    """``93 % ± 4 (89, 93, 97)``: mean, deviation, and each seed in order, in per cent."""
+    s = summarise((100 * values).tolist())
+    if s.mean is None:
+        return "-"
+    deviation = "" if s.deviation is None else f" ± {number(s.deviation, 0)}"
+    seeds = ", ".join(f"{value:.0f}" for value in 100 * values)
+    return f"{s.mean:.0f} %{deviation} ({seeds})"
+
+
+def without_effect(p: Parameters) -> list[str]:
+    """Variants whose evaluations are all those of another: their overrides change nothing here."""
+    result = []
+    for row in p.rows:
+        runs: dict[frozenset[tuple[str, str, int | None]], list[str]] = {}
+        for variant in p.variants:
+            cells = [c for c in p.cells if (c.row, c.agent) == (row.name, variant.name)]
+            if cells and all(c.run for c in cells):
+                runs.setdefault(frozenset((c.run, c.place, c.seed) for c in cells), []).append(
+                    variant.name
+                )
+        result += [
+            f"Same runs: {row.name}: {', '.join(names)} share every run: their overrides make no "
+            "difference under these settings."
+            for names in runs.values()
+            if len(names) > 1
+        ]
+    return result
+
+
+def figure(p: Parameters, found: pd.DataFrame) -> plt.Figure:
+    """A panel per row: each seed's retrained policies and student, by variant, and the gates."""
+    size = (0.8 + max(2.5, 0.9 * len(p.variants)) * len(p.rows), 3.6)
+    drawn, axes = plt.subplots(1, len(p.rows), figsize=size, squeeze=False, layout="constrained")
+    for axis, row in zip(axes[0], p.rows, strict=True):
+        _panel(axis, p, row, found)
+    axes[0, 0].set_ylabel("true return, % of the setting's expert")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    return drawn
+
+
+def _panel(axis: plt.Axes, p: Parameters, row: Row, found: pd.DataFrame) -> None:
+    ink = plt.rcParams["text.color"]
+    for gate, line in zip(GATES, ("--", ":"), strict=True):
+        axis.axhline(100 * gate, color=ink, lw=0.9, ls=line, alpha=0.7, label=f"{gate:.0%}")
+    for x, (variant, colour) in enumerate(colours(p.methods).items()):
+        for measure, shift, form, label in (
+            (_RETRAINED, -0.12, {"color": colour, "mew": 0}, "retrained, mean over settings"),
+            (_STUDENT, 0.24, {"mfc": "none", "color": colour}, "student, mean over settings"),
+        ):
+            values = 100 * over_settings(found, row, variant, measure).to_numpy()
+            n = len(values)
+            offsets = shift + (np.linspace(-0.1, 0.1, n) if n > 1 else np.zeros(n))
+            axis.plot(x + offsets, values, "o", ms=4.5, label=label if x == 0 else None, **form)
+            if measure == _RETRAINED and n:
+                axis.plot([x - 0.3, x + 0.06], [values.mean()] * 2, color=colour, lw=2)
+    names = [v.name.replace(" ", "\n", 1) for v in p.variants]
+    axis.set_xticks(range(len(names)), names, size=7.5)
+    axis.set_xlim(-0.6, len(names) - 0.4)
+    axis.set_title(row.name)
+    axis.grid(axis="y", alpha=0.25)
