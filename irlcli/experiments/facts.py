@@ -53,15 +53,19 @@ def left_out(
 ) -> list[Others]:
     """Artefacts on the same subject as a ``wanted`` one, but with other parameters or inputs.
 
-    They are grouped by how they differ. ``used`` are the ids of those that the report does use.
+    They are grouped by how they differ: from the most similar one, where variants want several.
+    ``used`` are the ids of those that the report does use.
     """
-    expected = {_subject(record): record for record in wanted}
+    expected: dict[_Subject, list[KeyRecord]] = {}
+    for record in wanted:
+        expected.setdefault(_subject(record), []).append(record)
     groups: dict[tuple[str, str, str], list[str]] = {}
     for artefact in artefacts:
         record = artefact.manifest.record
-        sought = expected.get(_subject(record))
-        if sought is None or artefact.id in used:
+        candidates = expected.get(_subject(record), [])
+        if not candidates or artefact.id in used:
             continue
+        sought = min(candidates, key=lambda other: len(_differing(record, other)))
         group = record.stage, _subject_text(record), _difference(record, sought)
         groups.setdefault(group, []).append(artefact.id)
     return [
@@ -110,8 +114,14 @@ def _difference(found: KeyRecord, sought: KeyRecord) -> str:
     if found.stage_version != sought.stage_version:
         return f"version {found.stage_version} of the stage instead of {sought.stage_version}"
     here, there = dict(flat(found.parameters)), dict(flat(sought.parameters))
-    names = sorted(n for n in here | there if here.get(n) != there.get(n))
+    names = _differing(found, sought)
     parts = [f"{n} {here.get(n, 'unset')} instead of {there.get(n, 'unset')}" for n in names]
     if not parts:
         return "other inputs"
     return ", ".join(parts[:4]) + (f" and {len(parts) - 4} more" if len(parts) > 4 else "")
+
+
+def _differing(found: KeyRecord, sought: KeyRecord) -> list[str]:
+    """The parameters in which two artefacts differ."""
+    here, there = dict(flat(found.parameters)), dict(flat(sought.parameters))
+    return sorted(n for n in here | there if here.get(n) != there.get(n))

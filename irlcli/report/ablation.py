@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from irlcli.report.agents import colours, title
+from irlcli.report.agents import title
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.statistics import holm, paired_p, summarise
 from irlcli.report.tables import Table
@@ -22,6 +22,7 @@ from irlcli.report.text import number, p_value, percent
 # Shares of the expert's return that a retrained policy is asked to reach.
 GATES = (0.8, 0.9)
 _RETRAINED, _STUDENT = "transfer-id", "id"
+_COLOUR = "#0072B2"
 _NOTE = (
     "{method}. True return in the settings trained on, as a share of that setting's own expert: mean ± standard "
     "deviation over seeds of the reward learning, then each seed. Retrained: policies trained from "
@@ -49,7 +50,8 @@ def shares(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     keys = ["row", "agent", "measure", "setting", "seed"]
     earned = measured.astype({"seed": int, "true_return": float, "progress": float})
     means = earned.groupby(keys, sort=False)[columns].mean().reset_index()
-    both = means.join(experts.where(experts > 0), on=["row", "setting"], rsuffix="_expert")
+    positive = experts.where(experts > 0).add_suffix("_expert")
+    both = means.join(positive, on=["row", "setting"])
     return both[keys].assign(
         share=both["true_return"] / both["true_return_expert"],
         progress_share=both["progress"] / both["progress_expert"],
@@ -184,13 +186,13 @@ def without_effect(p: Parameters) -> list[str]:
 
 def figure(p: Parameters, found: pd.DataFrame) -> plt.Figure:
     """A panel per row: each seed's retrained policies and student, by variant, and the gates."""
-    size = (0.8 + max(2.5, 0.9 * len(p.variants)) * len(p.rows), 3.6)
+    size = (0.8 + max(4.0, 0.9 * len(p.variants)) * len(p.rows), 3.8)
     drawn, axes = plt.subplots(1, len(p.rows), figsize=size, squeeze=False, layout="constrained")
     for axis, row in zip(axes[0], p.rows, strict=True):
         _panel(axis, p, row, found)
     axes[0, 0].set_ylabel("true return, % of the setting's expert")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    drawn.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     return drawn
 
 
@@ -198,17 +200,19 @@ def _panel(axis: plt.Axes, p: Parameters, row: Row, found: pd.DataFrame) -> None
     ink = plt.rcParams["text.color"]
     for gate, line in zip(GATES, ("--", ":"), strict=True):
         axis.axhline(100 * gate, color=ink, lw=0.9, ls=line, alpha=0.7, label=f"{gate:.0%}")
-    for x, (variant, colour) in enumerate(colours(p.methods).items()):
+    retrained = {"color": _COLOUR, "mew": 0}
+    student = {"color": ink, "mfc": "none", "alpha": 0.6}
+    for x, variant in enumerate(p.variants):
         for measure, shift, form, label in (
-            (_RETRAINED, -0.12, {"color": colour, "mew": 0}, "retrained, mean over settings"),
-            (_STUDENT, 0.24, {"mfc": "none", "color": colour}, "student, mean over settings"),
+            (_RETRAINED, -0.12, retrained, "retrained, mean over settings"),
+            (_STUDENT, 0.24, student, "student, mean over settings"),
         ):
-            values = 100 * over_settings(found, row, variant, measure).to_numpy()
+            values = 100 * over_settings(found, row, variant.name, measure).to_numpy()
             n = len(values)
             offsets = shift + (np.linspace(-0.1, 0.1, n) if n > 1 else np.zeros(n))
             axis.plot(x + offsets, values, "o", ms=4.5, label=label if x == 0 else None, **form)
             if measure == _RETRAINED and n:
-                axis.plot([x - 0.3, x + 0.06], [values.mean()] * 2, color=colour, lw=2)
+                axis.plot([x - 0.3, x + 0.06], [values.mean()] * 2, color=_COLOUR, lw=2)
     names = [v.name.replace(" ", "\n", 1) for v in p.variants]
     axis.set_xticks(range(len(names)), names, size=7.5)
     axis.set_xlim(-0.6, len(names) - 0.4)

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from irlcli.configs import load_config
-from irlcli.experiments.rows import Chosen, comparison
+from irlcli.experiments.rows import Chosen, Run, comparison
 from irlcli.experiments.tables import Row, Table
 from irlcli.store import Store
 
@@ -211,14 +211,13 @@ def test_further_retrainings_have_seeds_of_their_own():
         measures=("transfer",),
         retrainings=3,
     )
-    tasks = comparison(
-        table.rows[0],
-        table.measures,
-        table.retrainings,
-        [("erm", seed) for seed in table.seeds],
-        lambda env, flags: load_config(env, "smoke", flags=flags),
-        Chosen((), None),
-    )
+    row = table.rows[0]
+
+    def configs(env, flags):
+        return load_config(env, "smoke", flags=flags)
+
+    runs = [Run("erm", "erm", seed, str(row), configs) for seed in table.seeds]
+    tasks = comparison(row, table.measures, table.retrainings, runs, configs, Chosen((), None))
     found = {t.name: t.request.parameters.seed for t in tasks if t.phase == "transfers"}
     assert found["reacher.gravity.erm.0.transfer"] == 0
     assert found["reacher.gravity.erm.1.transfer"] == 1

@@ -511,6 +511,9 @@ def test_make_passes_its_variables_on():
     assert commands("experts", "RESULTS=docs/results/experts")[0].endswith(
         "--out docs/results/experts"
     )
+    ablation = commands("retraining", "METHODS=irm", "FROM=settings", "JOBS=4", "TAG=x")
+    assert len(ablation) == 5 and ablation[-1].endswith("--out results/x/retraining")
+    assert all(f" {w} " in ablation[-1] for w in ('--methods "irm"', "--from settings", "--jobs 4"))
     report = commands("report-table1")[0]
     assert "--name standard.table1 " in report
     assert report.endswith("--out results/standard/table1")
