@@ -74,6 +74,6 @@ def transfer(
         config.transfer_of(settings[0]),
         seed,
         label,
-        references.student_beside(source) if start == "student" else None,
+        references.student_beside(session.store, source, origin) if start == "student" else None,
     )
     session.deliver([request], name)

@@ -104,8 +104,9 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
                 "challengers, whose log pi they would hold, are gone",
                 "--set airl.logit=f, and --set airl.policy_reward to f or g",
             )
-        ppo = relevant_ppo(airl.challenger.ppo, discrete_actions, "airl.challenger.ppo")
-        ppo = replace(ppo, n_envs=airl.ppo.n_envs)
+        # Before what follows from the number of worlds: a minibatch is at most a rollout.
+        ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
+        ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
         airl = replace(airl, challenger=replace(airl.challenger, ppo=ppo))
     if airl.replay_share == 0.0:
         airl = replace(

@@ -209,7 +209,8 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
         learned_gap: learned return of the expert minus the policy's, both under ``ceiling``.
         ceiling: of the rewards that the policy was trained on, as a quantile of g on the
             demonstrations; None without.
-        clear: whether the difference that decides the verdict exceeds two standard errors.
+        clear: whether the differences that decide the verdict exceed two standard errors: of the
+            regret to the allowed one and, unless retrained, of the learned returns.
     """
 
     policy: str

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from irlcli.configs import Config
 from irlcli.data.descriptions import Reward
 from irlcli.errors import NotFound
-from irlcli.experiments.references import student_beside, tensor_file
+from irlcli.experiments.references import student_beside
 from irlcli.experiments.status import Lookup, source_in
 from irlcli.interventions import Setting, parse_setting
 from irlcli.stages import clone, record, train_expert
@@ -178,14 +178,9 @@ class Finder:
         if maker is not None:
             return source_in(maker, "policy.pt")
         try:
-            beside = student_beside(reward)
+            return student_beside(self._store, reward, origin)
         except NotFound:
             return None
-        # A folder may hold anything under that name.
-        student, about = tensor_file(self._store, str(beside.path), "policy")
-        own = about.agent, about.env, about.method, about.seed, about.settings
-        of = "student", origin.env, origin.method, origin.seed, origin.settings
-        return student if own == of else None
 
     def _retrained(self, reward: Source, place: str) -> list[Retrained]:
         found = []

@@ -76,6 +76,7 @@ class Plan:
             identity = identities(task.request)
             if identity in names:
                 continue
+            assert name not in self.tasks, f"two steps are called {name}"
             names[identity] = name
             self.tasks[name] = task
             self.needs[name] = tuple(

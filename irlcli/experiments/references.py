@@ -64,11 +64,11 @@ def tensor_file(
     return source, descriptions.parse(read_json(path), descriptions.Policy, path)
 
 
-def student_beside(reward: Source) -> Source:
+def student_beside(store: Store, reward: Source, origin: descriptions.Reward) -> Source:
     """The ``policy.pt`` of the student that was trained while ``reward`` was learned.
 
     Raises:
-        NotFound: there is none beside the reward's file.
+        NotFound: there is none beside the reward's file, or that of another reward.
     """
     if reward.artefact is not None:
         student = reward.artefact.directory / _only(reward.artefact, "policy.pt")
@@ -78,7 +78,14 @@ def student_beside(reward: Source) -> Source:
         raise NotFound(
             f"there is no student beside {reward.path}", f"--start student needs {student}"
         )
-    return source_of(Resolved(None, student))
+    source, about = tensor_file(store, str(student), "policy")
+    own = about.agent, about.env, about.method, about.seed, about.settings
+    if own != ("student", origin.env, origin.method, origin.seed, origin.settings):
+        raise NotFound(
+            f"{student} is not the student of the reward beside it",
+            "put the policy.pt of the same irl train-airl there",
+        )
+    return source
 
 
 def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:

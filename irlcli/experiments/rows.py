@@ -310,7 +310,8 @@ def _assessment(
     members = bank(row.env, places, requests.config, policies)
     for entry, recorded in members.items():
         owner = run.name if entry.kind in ("student", "retrained") else run.shared
-        policy = re.sub(r"[^A-Za-z0-9.]+", "-", entry.policy.replace(f"{row.knob}=", ""))
+        # The sign stays: it tells the expert of goal-y=-900 from that of goal-y=900.
+        policy = re.sub(r"[ ,:]+", "-", entry.policy.replace(f"{row.knob}=", ""))
         place = entry.setting.partition("=")[2].replace(":", "_")
         yield Task(f"{owner}.bank.{policy}.{place}", "returns", recorded)
     label = f"{train_airl.describe(learned.parameters.airl)} seed {run.seed}"

@@ -55,7 +55,7 @@ class Member(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """A verdict, and whether the difference that decides it exceeds two standard errors."""
+    """A verdict, and whether the differences that decide it exceed two standard errors."""
 
     verdict: Verdict
     clear: bool
@@ -97,9 +97,10 @@ def spearman(x: np.ndarray, y: np.ndarray, present: np.ndarray) -> np.ndarray:
 
 
 def lower_half(true: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Which entries [..., P] are present and at or below the median of ``true``."""
-    if not present.any(-1).all():
-        return present
+    """Which entries [..., P] are present and at or below the median of ``true``.
+
+    At least one is present.
+    """
     middle = np.nanmedian(np.where(present, true, np.nan), axis=-1, keepdims=True)
     return present & (true <= middle)
 
@@ -203,7 +204,7 @@ def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -
     if beyond <= 0.0:
         return Judgement("retrained", _is_clear(beyond, regret))
     verdict: Verdict = "wrong reward" if gap.mean <= 0.0 else "optimisation fell short"
-    return Judgement(verdict, _is_clear(gap.mean, gap))
+    return Judgement(verdict, _is_clear(beyond, regret) and _is_clear(gap.mean, gap))
 
 
 def _is_clear(margin: float, of: Measured) -> bool:

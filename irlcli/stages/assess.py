@@ -191,4 +191,4 @@ def _epic_distances(
     return found, ""
 
 
-STAGE = Stage("assess", 2, run)
+STAGE = Stage("assess", 3, run)

@@ -43,7 +43,8 @@ def request(
     """A policy trained on ``reward`` (a ``reward.pt``) in ``setting``.
 
     It begins at random, or as ``start``: the ``policy.pt`` of the student that was trained while
-    the reward was learned. ``reward_label`` tells in the label how the reward was learned. It is not part of the identity.
+    the reward was learned. ``reward_label`` tells in the label how the reward was learned; it is
+    not part of the identity.
 
     Outputs ``policy.pt``, ``policy.json`` and ``metrics.parquet``.
 

@@ -200,6 +200,25 @@ def test_each_measure_of_a_retrained_policy_has_its_own_steps(irl, tmp_path):
     assert sum(".transfer" in name or ".from-student" in name for name in steps) == 16
 
 
+def test_a_bank_tells_opposite_values_apart(irl, tmp_path):
+    """The experts of goal-y=-900 and of goal-y=900 are two steps in the setting 900."""
+    tables = tmp_path / "tables.toml"
+    tables.write_text(
+        TABLES.replace("lunar-lander.engine-power", "half-cheetah.goal-y").replace(
+            'measures = ["transfer"]', 'measures = ["zero-shot", "assess"]'
+        )
+    )
+    words = ["plan", "tiny", "--experiments", tables, "--profile", "smoke", "--json"]
+    done = irl(*words, "--store", tmp_path / "none")
+    assert done.code == 0, done.err
+    steps = {s["name"]: s for s in json.loads(done.out)["steps"]}
+    row = "smoke.half-cheetah.goal-y"
+    for value in ("-900", "900"):
+        recorded = f"{row}.bank.expert-of-{value}.900"
+        assert steps[recorded]["needs"] == [f"{row}.expert.{value}"]
+        assert recorded in steps[f"{row}.irm.0.assess"]["needs"]
+
+
 def test_further_retrainings_have_seeds_of_their_own():
     """Retraining 0 keeps the reward's seed; no two policies share one."""
     table = Table(

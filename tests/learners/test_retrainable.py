@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
 from irlcli.configs.relevance import relevant_airl
 from irlcli.errors import UsageError
-from irlcli.learners import discriminator
+from irlcli.learners import airl, discriminator
 from irlcli.learners.pools import Minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions
@@ -149,6 +149,51 @@ def test_a_challenger_is_paid_the_bounded_reward(demos):
         assert (paid < g).any()
 
 
+def test_a_challengers_absorbing_state_earns_a_series_in_its_own_discount(demos):
+    """At gamma = 0.5, gamma / (1 - gamma) = 1 times the bounded reward; the student's is 0.99."""
+    challenger = replace(CHALLENGED["challenger"], ppo=replace(LONG, gamma=0.5))
+    trainer, learner, _ = challenged(demos, challenger=challenger)
+    (rollout,) = trainer.train_round(0, learner)
+    data = rollout.transitions(slice(None), HORIZON)
+    with torch.no_grad():
+        actions = learner.model.encode(torch.as_tensor(data.actions))
+        g = learner.model.reward(torch.as_tensor(data.observations), actions).numpy()
+        absorbing, _ = learner.model.absorbing_reward(torch.as_tensor(data.next_observations))
+    highest = np.quantile(learner.quantiles, challenger.ceiling)
+    series = np.where(data.terminated, np.minimum(absorbing.numpy(), highest), 0.0)
+    paid = learner.challenger_rewards(rollout, trainer.policy).ravel()
+    assert data.terminated.any()
+    np.testing.assert_allclose(paid, np.minimum(g, highest) + series, rtol=1e-4, atol=1e-5)
+
+
+def test_past_challengers_are_replayed_beside_the_present_one(demos, monkeypatch):
+    """The challengers of round k are made to be at 5 + k; the student's past stays apart."""
+    trainer, learner, challengers = challenged(demos)
+    drawn, original = [], airl.sample_minibatch
+
+    def spied(risks, generator, past_share=None):
+        if past_share is None:  # the diagnostics draw no past
+            return original(risks, generator)
+        drawn.append(risks)
+        return original(risks, generator, past_share)
+
+    monkeypatch.setattr(airl, "sample_minibatch", spied)
+    for index in range(2):
+        rollouts = trainer.train_round(index, learner)
+        challenge = challengers.train_round(index)
+        challenge = [replace_observations(r, 5.0 + index) for r in challenge]
+        learner.update(index, rollouts, trainer.policy, challenge)
+    student, challenger = (
+        [stratum for strata in risks for stratum in strata] for risks in drawn[-2:]
+    )
+    for stratum in challenger:
+        (past,) = stratum.past
+        assert (stratum.policy.observations == 6.0).all() and (past.observations == 5.0).all()
+    for stratum in student:
+        (past,) = stratum.past
+        assert not (past.observations == 5.0).all(-1).any()
+
+
 def test_challengers_are_negatives(demos):
     """With the whole weight on challengers, the student's own samples teach g nothing."""
     lowered = {}
@@ -189,3 +234,12 @@ def test_challengers_need_logits_without_log_pi():
 def test_challengers_live_in_the_students_worlds():
     airl = AIRLConfig(logit="f", challenger=ChallengerConfig(life=3, ppo=CONFIG.ppo))
     assert relevant_airl(airl, True).challenger.ppo.n_envs == airl.ppo.n_envs
+
+
+def test_the_number_of_worlds_a_challenger_is_configured_with_does_not_matter():
+    """Not for the largest minibatch either, which is a rollout in the student's worlds."""
+    found = [
+        relevant_airl(AIRLConfig(logit="f", challenger=ChallengerConfig(life=3, ppo=ppo)), True)
+        for ppo in (PPOConfig(n_envs=n, n_steps=32, batch_size=128) for n in (1, 16))
+    ]
+    assert found[0] == found[1] and found[0].challenger.ppo.batch_size == 128

@@ -154,6 +154,8 @@ EXPERT, RANDOM = known(100.0), known(0.0)
         (50.0, 0.0, "wrong reward", False),
         (50.0, 50.0, "optimisation fell short", True),
         (50.0, 1.5, "optimisation fell short", False),
+        (89.0, -50.0, "wrong reward", False),  # regret 11 of the 10 allowed
+        (89.0, 50.0, "optimisation fell short", False),
     ],
 )
 def test_the_verdict_on_a_retrained_policy(earned, gap, verdict, clear):

@@ -126,6 +126,9 @@ def test_the_retrained_policy_begins_as_the_student(runs, irl, words, monkeypatc
     (outside / "policy.pt").unlink()
     missing = irl(*command, *common(runs))
     assert missing.code == 3 and "there is no student beside" in missing.err
+    shutil.copy(scratch.directory / "policy.pt", outside)
+    foreign = irl(*command, *common(runs))
+    assert foreign.code == 3 and "is not the student of the reward" in foreign.err
 
 
 def test_a_ceiling_changes_the_policy_and_evaluations_stay_unbounded(runs, irl):
