@@ -98,6 +98,19 @@ def test_what_else_is_minimised_is_not_part_of_the_penalty(weight):
     torch.testing.assert_close(both.total, expected / max(1.0, weight))
 
 
+def test_the_slopes_of_student_and_challenger_are_penalised_alike(demos, monkeypatch):
+    """0.5 times the mean of 3 and 5 joins the loss."""
+    risk = Minibatch(*(t[:1] for t in vars(a_batch(observations=8, actions=4)).values()))
+    totals = []
+    for weight in (0.0, 0.5):
+        _, learner = make(demos, logit="f", gradient_penalty=weight)
+        slopes = iter((torch.tensor(3.0), torch.tensor(5.0)))
+        monkeypatch.setattr(airl, "gradient_penalty", lambda *_, slopes=slopes: next(slopes))
+        torch.manual_seed(0)
+        totals.append(learner._loss([risk, risk], 0.0, torch.Generator()).total.detach())
+    torch.testing.assert_close(totals[1] - totals[0], torch.tensor(0.5 * 4.0))
+
+
 def test_a_linear_schedule_ends_at_zero(demos):
     trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, learning_rate_schedule="linear")
     (rollout,) = trainer.train_round(0, learner)

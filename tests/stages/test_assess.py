@@ -8,9 +8,10 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from irlcli.data.demonstrations import read_demonstrations
-from irlcli.data.tensors import load_policy_file
+from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke", "--quiet"]
@@ -130,6 +131,46 @@ def test_a_policy_retrained_on_the_reward_is_judged_where_the_expert_is_known(as
     assert split["learned_gap"]["mean"] == pytest.approx(gap)
     shown = irl(*line)
     assert split["verdict"] in shown.err and "Spearman" in shown.err
+
+
+def test_expert_minus_idle_counts_absorbing_steps(assessed):
+    """The learned return of an episode that ends early goes on to the horizon of 1000 steps."""
+    _, document = assessed
+    bank = {(e["policy"], e["setting"]): e["learned"] for e in document["assessment"]["bank"]}
+    for place in document["assessment"]["settings"]:
+        setting = place["setting"]
+        gap = bank[f"expert of {setting}", setting]["mean"] - bank["idle", setting]["mean"]
+        assert place["expert_minus_idle"]["mean"] == pytest.approx(gap / 1000)
+
+
+def test_a_policy_trained_under_a_ceiling_is_judged_under_it(assessed, irl):
+    """The learned gap, once more from the recorded steps."""
+    path, _ = assessed
+    here = ["--intervention", "engine-power=1x", "--store", path, *SMOKE]
+    done = irl("transfer", "--reward", "airl", "--set", "transfer.ceiling=0.3", *here)
+    assert done.code == 0, done.err
+    done = irl("assess", "airl", *here, "--json")
+    (split,) = json.loads(done.out)["assessment"]["settings"][0]["retrained"]
+    artefact = Store(path).resolve(json.loads(done.out)["id"]).artefact
+    model, origin = load_reward_file(Store(path).resolve("airl").artefact.directory / "reward.pt")
+    level = origin.quantiles[30]
+
+    def learned(policy):
+        sha = artefact.manifest.record.inputs[f"engine-power=1x {policy}"]
+        recorded = read_demonstrations(Store(path).index().holders(sha)[0].directory)
+        return np.mean([bounded(t) for t in recorded.trajectories["engine-power=1x"]])
+
+    def bounded(t):
+        with torch.no_grad():
+            states, actions = torch.as_tensor(t.observations), torch.as_tensor(t.actions)
+            steps = model.reward(states[:-1], model.encode(actions)).clamp(max=level).sum()
+            final, _ = model.absorbing_reward(states[-1:])
+        rest = (1000 - len(t)) * t.terminated * final.clamp(max=level)
+        return float(steps + rest) / origin.scale
+
+    gap = learned("expert of engine-power=1x") - learned(split["policy"])
+    assert split["ceiling"] == 0.3
+    assert split["learned_gap"]["mean"] == pytest.approx(gap, rel=1e-4, abs=1e-3)
 
 
 def test_the_clone_imitates(assessed):
