@@ -21,6 +21,7 @@ from irlcli.configs import load_config
 from irlcli.envs.registry import environment
 from irlcli.interventions import parse_settings
 from irlcli.learners.airl import AIRL
+from irlcli.rl.challengers import Challengers
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
 from irlcli.rl.worlds import action_space, make_worlds
@@ -28,7 +29,7 @@ from irlcli.rl.worlds import action_space, make_worlds
 INTERVENTIONS = {
     "lunar-lander": "engine-power=1x,1.25x",
     "ant": "leg-length=1x,2x",
-    "half-cheetah": "leg-length=0.7,1.3",
+    "half-cheetah": "friction=1.5:0.1:0.1,2:0.6:0.6",
 }
 
 
@@ -52,11 +53,16 @@ def main() -> None:
         demos,
         config,
         worlds=len(worlds),
+        rounds=trainer.rounds,
         horizon=environment(arguments.env).max_episode_steps,
         observation_size=worlds.observation_space.shape[0],
         actions=action_space(worlds.action_space),
         seed=0,
     )
+
+    challengers = None
+    if config.challenger.life > 0:
+        challengers = Challengers(worlds, config.challenger, learner, 0, "bench")
 
     seconds: dict[str, float] = defaultdict(float)
     worlds.step = _timed(worlds.step, seconds, "environment")
@@ -77,14 +83,23 @@ def main() -> None:
         seconds["bare stepping"] += time.process_time() - started
         started = time.process_time()
         rollouts = trainer.train_round(index + 1, learner)
+        challenge = []
+        if challengers is not None:
+            own = dict(seconds)
+            before = time.process_time()
+            challenge = challengers.train_round(index + 1)
+            seconds["challenger"] += time.process_time() - before
+            # Its steps are counted there, not as the student's environment.
+            seconds["environment"] = own["environment"]
         policy_done = time.process_time()
-        learner.update(index + 1, rollouts, trainer.policy)
+        learner.update(index + 1, rollouts, trainer.policy, challenge)
         ended = time.process_time()
         seconds["discriminator"] += ended - policy_done
         seconds["AIRL in all"] += ended - started
         steps += count
     seconds["policy forward and buffer"] = seconds.pop("rollout") - seconds["environment"]
-    parts = ("environment", "policy forward and buffer", "rewards", "PPO update", "discriminator")
+    parts = ["environment", "policy forward and buffer", "rewards", "PPO update", "discriminator"]
+    parts += [] if challengers is None else ["challenger"]
     seconds["rest"] = seconds["AIRL in all"] - sum(seconds[part] for part in parts)
 
     print(

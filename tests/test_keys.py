@@ -187,8 +187,12 @@ REQUESTS = {
 }
 # Reports read evaluations that are named one by one; no config field reaches them otherwise.
 REPORTS = {"report", "report-experts"}
-# AIRL refuses gSDE, so its frequency is not read. Challengers act in the student's worlds.
-UNREAD_AIRL = ["airl.ppo.sde_sample_freq", "airl.challenger.ppo.n_envs"]
+# AIRL refuses gSDE, so its frequency is not read. Challengers act in the student's worlds. Logits of
+# f alone have one scaling.
+UNREAD_AIRL = [
+    *("airl.ppo.sde_sample_freq", "airl.challenger.ppo.n_envs"),
+    "airl.penalty_scaling",
+]
 # What a stage does not read, whatever the other fields are.
 UNREAD = {
     # The bar is for the report of the experts.
@@ -359,6 +363,7 @@ IRRELEVANT = [
     # A ramp of 0 rounds, or of 1.
     (airl, {"airl.penalty_ramp_rounds": 0}, ["airl.penalty_ramp_rounds"]),
     (airl, {"airl.grouping": "pooled"}, ["airl.pairing"]),
+    (airl, {"airl.logit": "f"}, ["airl.penalty_scaling"]),
     (
         airl,
         {"airl.replay_share": 0.0},
@@ -390,6 +395,18 @@ def test_fields_without_influence_do_not_change_the_key(request_, changes, field
     for path in fields:
         changed = with_field(config, path, another(path, field_of(config, path)))
         assert changed != config and key(request_(changed)) == key(request_(config)), path
+
+
+def test_the_scaling_of_logits_with_log_pi_is_in_the_key():
+    config = with_field(in_use(), "airl.challenger.life", 0)
+    config = with_field(config, "airl.logit", "f-log-pi")
+    assert key(airl(config)) != key(airl(with_field(config, "airl.penalty_scaling", "reward")))
+
+
+def test_without_shaping_g_is_f():
+    plain = with_field(in_use(), "airl.shaping", False)
+    keys = {key(airl(with_field(plain, "airl.policy_reward", form))) for form in ("f", "g")}
+    assert len(keys) == 1
 
 
 @pytest.mark.parametrize(("request_", "section"), [(airl, "airl"), (maxent, "maxent")])

@@ -95,6 +95,11 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         airl = replace(airl, activation=_AIRL.activation)
     if airl.grouping == "pooled":
         airl = replace(airl, pairing=_AIRL.pairing)
+    if airl.logit == "f":
+        # f is all that w could multiply.
+        airl = replace(airl, penalty_scaling=_AIRL.penalty_scaling)
+    if not airl.shaping and airl.policy_reward == "g":
+        airl = replace(airl, policy_reward="f")
     if airl.challenger.life == 0:
         airl = replace(airl, challenger=_AIRL.challenger)
     else:

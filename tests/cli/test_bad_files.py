@@ -118,6 +118,7 @@ NETWORK = {
     "hidden": [32, 32],
     "activation": "tanh",
     "gamma": 0.99,
+    "shaping": True,
 }
 
 
