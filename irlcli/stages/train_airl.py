@@ -103,6 +103,8 @@ def describe(airl: AIRLConfig) -> str:
         parts.append(f"selected by {airl.select}")
     if airl.bc_epochs:
         parts.append("from a clone")
+    if airl.challenger.life:
+        parts.append("with challengers")
     return " ".join(parts)
 
 

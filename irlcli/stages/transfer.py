@@ -107,8 +107,10 @@ def run(job: Job) -> None:
             actions=action_space(worlds.action_space),
             ceiling=p.transfer.ceiling,
         )
+        # Other moments of the observations would turn the student into another policy.
+        kept = {} if student is None else {"keep_moments": True}
         trainer = algorithm(p.transfer.algorithm)(
-            worlds, config, p.transfer.total_steps, p.seed, STAGE.name
+            worlds, config, p.transfer.total_steps, p.seed, STAGE.name, **kept
         )
         if student is not None:
             require_observations(student, worlds.observation_space, where)
