@@ -1,8 +1,8 @@
 # make demo       train, learn a reward and retrain on it in LunarLander: the whole chain, in minutes
 # make test       the tests              make lint   ruff and mypy
 # make table1     a table of the paper: missing experts, rewards, retrained policies and returns are
-#                 made, then the report. Also figure2 figure3 figure4 table2 experts retraining
-#                 all-results.
+#                 made, then the report. Also figure2 figure3 figure4 table2 experts gates
+#                 retraining all-results.
 #                 `make table1.rewards` stops after a phase: experts, rewards, transfers or returns.
 # make report-table1      a report on what exists; runs nothing
 # make bench torture clean help
@@ -35,7 +35,7 @@ CHOSEN   = --store $(STORE) --profile $(PROFILE) $(addprefix --from ,$(wildcard 
 OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG))
 
 .PHONY: help demo test lint bench torture all-results experts table1 table2 figure2 figure3 figure4
-.PHONY: retraining clean
+.PHONY: gates retraining clean
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -64,7 +64,7 @@ demo: $(READY)
 
 all-results: experts table1 figure2 figure3 figure4 table2
 
-table1 figure3 figure4 retraining: %: %.returns
+table1 figure3 figure4 gates retraining: %: %.returns
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 %.returns: %.transfers
 	$(IRL) run $* $(OPTIONS) --until returns
