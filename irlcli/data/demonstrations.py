@@ -36,6 +36,18 @@ class Demonstrations:
     trajectories: Mapping[str, tuple[Trajectory, ...]]
     metadata: Mapping[str, Any]
 
+    def require(self, env: str, settings: Sequence[str]) -> None:
+        """Refuse demonstrations of another environment, or without one of ``settings``.
+
+        Raises:
+            IntegrityError: naming what they are of, and what is asked for.
+        """
+        if self.env != env or not set(settings) <= set(self.trajectories):
+            raise IntegrityError(
+                f"the demonstrations are of {self.env} {', '.join(self.trajectories)}, but "
+                f"{env} {', '.join(settings)} is asked for"
+            )
+
 
 def write_demonstrations(
     directory: Path,

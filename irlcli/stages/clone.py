@@ -87,11 +87,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env = p.environment.name
     demos = read_demonstrations(job.inputs["demonstrations"])
-    if demos.env != env or not set(p.settings) <= set(demos.trajectories):
-        raise IntegrityError(
-            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, but "
-            f"{env} {', '.join(p.settings)} is asked for"
-        )
+    demos.require(env, p.settings)
     # The trainer is only there for its policy: it never acts.
     ppo = PPOConfig(n_envs=1, n_steps=2, batch_size=2, **msgspec.structs.asdict(p.network))
     setting = parse_setting(env, p.settings[0])

@@ -143,11 +143,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, airl = p.environment.name, p.airl
     demos = read_demonstrations(job.inputs["demonstrations"])
-    if demos.env != env or not set(p.settings) <= set(demos.trajectories):
-        raise IntegrityError(
-            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, but "
-            f"{env} {', '.join(p.settings)} is asked for"
-        )
+    demos.require(env, p.settings)
     settings = _trained(airl, p.settings)
     episodes: list[Sequence[Trajectory]] = [demos.trajectories[text] for text in settings]
     held_out: list[Sequence[Trajectory]] = []
