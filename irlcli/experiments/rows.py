@@ -305,7 +305,7 @@ def _run(
         )
         yield Task(f"{name}.cue", "returns", request, requests.cell(agent, CUE, seed))
     if ASSESS in measures:
-        yield from _assessment(requests, demos, learned, retrained, run)
+        yield from _assessment(requests, demos, learned, retrained, run, measures)
 
 
 def _imitation(
@@ -330,10 +330,15 @@ def _assessment(
     learned: Request,
     retrained: Mapping[str, Sequence[Retrained]],
     run: Run,
+    measures: Sequence[str],
 ) -> Iterator[Task]:
-    """The bank of a row's policies, and how well the reward of ``learned`` ranks them."""
+    """The bank of a row's policies, and how well the reward of ``learned`` ranks them.
+
+    It has the unseen setting only where another measure does.
+    """
     row, trained, unseen = requests.row, requests.trained, requests.unseen
-    places = [*trained, *unseen]
+    looked_at = not set(measures) <= {*IN_DISTRIBUTION, ASSESS, CUE}
+    places = [*trained, *(unseen if looked_at else ())]
     imitation = clone.request(From(demos), row.env, trained, requests.config)
     yield Task(f"{run.shared}.clone", "returns", imitation)
     experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}
