@@ -32,6 +32,8 @@ LAYERS = [
     ["report"],
     ["stages"],
     ["experiments"],
+    # Options as requests: below both front ends, the command line and the notebook facade.
+    ["requests"],
     ["rewards"],
     ["cli"],
 ]
@@ -56,6 +58,7 @@ NEVER = {
     "report": {"torch", "stable_baselines3", "irlcli.stages", "irlcli.rl", "irlcli.learners"},
     "stages": {"stable_baselines3"},
     "experiments": HEAVY | {"numpy"},
+    "requests": HEAVY | {"numpy", "typer", "rich"},
 }
 EXCEPTIONS = {
     # GIFs of a policy at work.
@@ -194,7 +197,8 @@ def test_only_rl_knows_stable_baselines():
     [
         name
         for name in modules()
-        if name.split(".")[0] in ("cli", "stages", "experiments", "store", "configs", "methods")
+        if name.split(".")[0]
+        in ("cli", "requests", "stages", "experiments", "store", "configs", "methods")
         or name in ("errors", "interventions", "envs.registry", "__main__")
         or name in ("learners.__init__", "rl.__init__", "penalties.__init__", "envs.__init__")
         or name.endswith(".spec")

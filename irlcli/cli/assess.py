@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from irlcli.cli import arguments
 from irlcli.cli import console as out
 from irlcli.cli.options import Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
@@ -12,6 +11,7 @@ from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured
 from irlcli.errors import UsageError
 from irlcli.experiments import bank, references
 from irlcli.interventions import parse_setting
+from irlcli.requests import arguments
 from irlcli.stages import assess as stage
 from irlcli.stages.train_airl import describe
 from irlcli.store import Artefact

@@ -1,18 +1,13 @@
 """``irl collect-experts``."""
 
-from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from irlcli.cli import arguments, complete
+from irlcli.cli import complete
 from irlcli.cli.options import Name, OneSetting, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.data.descriptions import Collected
-from irlcli.envs.registry import resolve
-from irlcli.errors import UsageError
-from irlcli.experiments.references import output
-from irlcli.stages import collect_experts as stage
+from irlcli.requests import collect as requested
 
 
 @stage_command
@@ -55,34 +50,16 @@ def collect_experts(
     name: Name = None,
 ) -> None:
     """Train an expert per setting and record its demonstrations."""
-    if intervention is None and not setting:
-        raise UsageError(
-            "neither --intervention nor --setting names a setting",
-            "give --intervention KNOB=VALUE,VALUE or --setting KNOB=VALUE,KNOB=VALUE",
-        )
-    env = resolve(env).name
-    config = session.config(env)
-    named = (
-        [] if intervention is None else arguments.named_settings(env, config, intervention, "id")
+    request = requested.collect_experts(
+        session,
+        env=env,
+        intervention=intervention,
+        setting=setting,
+        expert=expert,
+        trust=trust,
+        episodes=episodes,
+        seed=seed,
     )
-    settings = arguments.with_several(env, named, setting)
-    listed = config.interventions.get(intervention or "")
-    counts: Sequence[int] = ()
-    if episodes is not None:
-        counts = arguments.counts(episodes)
-    elif listed is not None and not setting:
-        counts = listed.episodes
-    experts = arguments.experts(session.store, env, expert)
-    request = stage.request(env, settings, config, seed, counts, experts, trust)
     for artefact in session.deliver([request], name):
-        _warn_of_missed_bars(session, artefact, config.expert.bar)
-
-
-def _warn_of_missed_bars(session: StageSession, artefact: Any, bar: float | None) -> None:
-    summary = output(session.store, artefact, "summary.json", Collected)
-    for row in summary.settings:
-        if bar is not None and row.mean_return < bar:
-            session.console.warn(
-                f"the expert of {summary.env} {row.setting} is below its bar: mean true return "
-                f"{row.mean_return:.0f} over {row.episodes} episodes, bar {bar:.0f}"
-            )
+        for warning in requested.missed_bars(session, artefact):
+            session.console.warn(warning)

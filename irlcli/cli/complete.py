@@ -16,15 +16,11 @@ def methods(incomplete: str) -> list[tuple[str, str]]:
 
 
 def maxent_methods(incomplete: str) -> list[tuple[str, str]]:
-    """Those of :func:`methods` that MaxEnt IRL has as well: AIRL's, by penalties of its own."""
+    """Those of :func:`methods` that MaxEnt IRL has as well, with their titles."""
     from irlcli.methods import METHODS
+    from irlcli.penalties import maxent_methods
 
-    own = penalties("maxent")
-    return [
-        (method.name, method.title)
-        for method in METHODS.values()
-        if method.learner == "airl" and not method.sets and method.penalty in own
-    ]
+    return [(name, METHODS[name].title) for name in maxent_methods()]
 
 
 def groupings(incomplete: str) -> list[str]:

@@ -1,68 +1,14 @@
 """``irl evaluate``."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated
 
 import typer
 
-from irlcli import labels
-from irlcli.cli import arguments, returns
+from irlcli.cli import returns
 from irlcli.cli.options import Env, Name, OneSetting, Seed, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.data.descriptions import Evaluation, Policy
-from irlcli.data.descriptions import Reward as RewardDescription
-from irlcli.envs.registry import environment
-from irlcli.errors import UsageError
-from irlcli.experiments import references
-from irlcli.interventions import Setting, check_observed, parse_setting
-from irlcli.stages import evaluate as stage
-from irlcli.stages.base import From, Request, Source
-from irlcli.store import Artefact
-
-if TYPE_CHECKING:
-    from irlcli.configs import Config
-
-
-class _Where(NamedTuple):
-    """``--ood`` or ``--intervention`` as given, and the texts of ``--setting``."""
-
-    text: str | None
-    kind: Literal["id", "ood"]
-    several: Sequence[str]
-
-    @property
-    def given(self) -> bool:
-        """Whether any setting is named."""
-        return self.text is not None or bool(self.several)
-
-    def settings(
-        self, env: str, config: "Config", origin: RewardDescription | Policy | None
-    ) -> list[Setting]:
-        """The named settings.
-
-        Raises:
-            UsageError: malformed, or with other observations than ``origin``'s.
-        """
-        named: Sequence[Setting] = ()
-        if self.text is not None:
-            named = arguments.named_settings(env, config, self.text, self.kind, origin)
-        return arguments.with_several(env, named, self.several, origin)
-
-
-class _Reward(NamedTuple):
-    """A learned reward that scores the episodes besides the true one."""
-
-    ref: str
-    source: Source
-    origin: RewardDescription
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Keywords of ``evaluate.request``."""
-        from irlcli.stages.train_airl import describe
-
-        label = f"{describe(self.origin.airl)} seed {self.origin.seed}"
-        return {"reward": self.source, "reward_label": label}
+from irlcli.report.returns import as_json
+from irlcli.requests import evaluate as requested
 
 
 @stage_command
@@ -101,128 +47,24 @@ def evaluate(
     name: Name = None,
 ) -> None:
     """Measure the return of a policy, an expert or a baseline."""
-    given = sum([policy is not None, expert, random, idle])
-    if given != 1:
-        raise UsageError(
-            f"{given or 'no'} agents are named, but one is needed",
-            "give one of --policy REF, --expert, --random, --idle",
-        )
-    if ood is not None and intervention is not None:
-        raise UsageError("--ood and --intervention both name settings", "give one of them")
-    if trained_in is not None and not expert:
-        raise UsageError("--trained-in selects experts, but --expert is missing", "add --expert")
-    env = arguments.env_name(env)
-    where = _Where(intervention, "id", setting)
-    if ood is not None:
-        where = _Where(ood, "ood", setting)
-    scored_by = None
-    if reward is not None:
-        source, origin = references.tensor_file(session.store, reward, "reward")
-        arguments.check_env(reward, origin.env, env)
-        scored_by = _Reward(reward, source, origin)
-    if policy is not None:
-        requests = [_of_policy(session, policy, where, env, episodes, seed, scored_by)]
-    else:
-        agent: Literal["expert", "random", "idle"]
-        agent = "expert" if expert else "random" if random else "idle"
-        requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scored_by)
-    if name is not None and len(requests) > 1:
-        raise UsageError(
-            f"--name {name!r} cannot name {len(requests)} evaluations",
-            "evaluate one expert at a time to name it",
-        )
-
-    def measured(artefact: Artefact) -> tuple[Evaluation, dict[str, Any], bool]:
-        own = scored_by is not None and references.by_own_reward(artefact, session.store.index())
-        return references.evaluation(session.store, artefact.id)[1], {}, own
-
+    requests = requested.evaluate(
+        session,
+        policy=policy,
+        expert=expert,
+        trained_in=trained_in,
+        random=random,
+        idle=idle,
+        reward=reward,
+        ood=ood,
+        intervention=intervention,
+        setting=setting,
+        env=env,
+        episodes=episodes,
+        seed=seed,
+        name=name,
+    )
     artefacts = session.deliver(
-        requests, name, lambda artefact: {"returns": returns.as_json([measured(artefact)])}
+        requests, name, lambda made: {"returns": as_json([requested.measured(session, made)])}
     )
     if artefacts and not session.as_json:
-        returns.print_rows([measured(artefact) for artefact in artefacts], stderr=True)
-
-
-def _of_policy(
-    session: StageSession,
-    policy: str,
-    where: _Where,
-    env: str | None,
-    episodes: int | None,
-    seed: int,
-    scored_by: _Reward | None,
-) -> Request:
-    source, origin = references.tensor_file(session.store, policy, "policy")
-    arguments.check_env(policy, origin.env, env)
-    config = session.config(origin.env, {"evaluation.episodes": episodes})
-    settings: Sequence[Setting]
-    if where.given:
-        settings = where.settings(origin.env, config, origin)
-    else:
-        settings = [parse_setting(origin.env, text) for text in origin.settings]
-    if scored_by is not None:
-        arguments.check_env(scored_by.ref, scored_by.origin.env, origin.env)
-        check_observed(origin.env, scored_by.origin.settings, settings)
-    label = f"{origin.agent} of {', '.join(origin.settings)}"
-    if origin.method is not None:
-        how = labels.retrained(origin.algorithm, origin.ceiling, origin.from_student)
-        label = f"{origin.agent} {origin.method} {how}".strip() + f" of seed {origin.seed}"
-    return stage.request(
-        origin.env,
-        settings,
-        config.evaluation,
-        source,
-        seed=seed,
-        policy_label=label,
-        **({} if scored_by is None else scored_by.arguments),
-    )
-
-
-def _of_agent(
-    session: StageSession,
-    agent: Literal["expert", "random", "idle"],
-    trained_in: str | None,
-    where: _Where,
-    env: str | None,
-    episodes: int | None,
-    seed: int,
-    scored_by: _Reward | None,
-) -> list[Request]:
-    if scored_by is not None:
-        env = scored_by.origin.env
-    if env is not None:
-        environment(env)
-    if env is None or not where.given:
-        missing = "--env ENV " if env is None else ""
-        raise UsageError(
-            f"--{agent} needs the settings to evaluate in",
-            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood",
-        )
-    config = session.config(env, {"evaluation.episodes": episodes})
-    origin = None if scored_by is None else scored_by.origin
-    settings = where.settings(env, config, origin)
-    score = {} if scored_by is None else scored_by.arguments
-    if agent != "expert":
-        return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **score)]
-    from irlcli.stages import train_expert
-
-    experts: list[tuple[Setting, Sequence[Setting]]]
-    if trained_in is None:
-        experts = [(setting, [setting]) for setting in settings]
-    else:
-        trained = arguments.named_settings(env, config, trained_in, "id")
-        experts = [(setting, settings) for setting in trained]
-        for setting, measured in experts:
-            check_observed(env, [str(setting)], measured)
-    return [
-        stage.request(
-            env,
-            measured,
-            config.evaluation,
-            From(train_expert.demonstrator(env, own, config), "policy.pt"),
-            seed=seed,
-            policy_label=f"expert of {own}",
-            **score,
-        )
-        for own, measured in experts
-    ]
+        returns.print_rows([requested.measured(session, made) for made in artefacts], stderr=True)

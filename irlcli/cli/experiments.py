@@ -14,14 +14,14 @@ from irlcli.cli import console as out
 from irlcli.cli.cluster import ClusterOptions
 from irlcli.cli.options import planning_command, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.cli.tables import Choice, check_out, copy_outputs, open_plan, print_report, report_of
+from irlcli.cli.tables import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
+from irlcli.requests.tables import Choice, open_plan, steps_of
 
 if TYPE_CHECKING:
     from irlcli.experiments.execute import Outcome
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.runner import Runner
-    from irlcli.experiments.status import Step
 
 _TableName = Annotated[
     str, typer.Argument(metavar="TABLE", help="e.g. table1.", autocompletion=complete.tables)
@@ -94,45 +94,22 @@ def plan(
 
 def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
     command = _child_words(session, choice, found)
-    steps = {name: found.step(name) for name in found.tasks}
-    versions = {name: _other_versions(step) for name, step in steps.items()}
-    counts = found.counts()
+    steps, counts = steps_of(found), found.counts()
     if session.as_json:
-        document = [
-            {
-                "name": name,
-                "key": step.key,
-                "status": step.status,
-                "request": step.label,
-                "why": step.why,
-                "needs": list(found.needs[name]),
-                "other_versions": versions[name],
-                "command": ["irl", *command(name)],
-            }
-            for name, step in steps.items()
-        ]
-        out.print_json("plan", {"table": choice.table, "counts": counts, "steps": document})
+        for step in steps:
+            step["command"] = ["irl", *command(step["name"])]
+        out.print_json("plan", {"table": choice.table, "counts": counts, "steps": steps})
         return
-    for name, step in steps.items():
-        out.print_data(f"{step.status:8}{name}: {step.why}")
+    for step in steps:
+        out.print_data(f"{step['status']:8}{step['name']}: {step['why']}")
     parts = [f"{count} {status}" for status, count in counts.items() if count]
     out.print_note(f"{len(steps)} steps: {', '.join(parts)}")
-    older = [text for texts in versions.values() for text in texts]
+    older = [step["other_versions"] for step in steps if step["other_versions"]]
     if older:
-        count = sum(bool(texts) for texts in versions.values())
         session.console.warn(
-            f"{count} of the artefacts were made with other library versions: "
-            f"{', '.join(sorted(set(older)))}"
+            f"{len(older)} of the artefacts were made with other library versions: "
+            f"{', '.join(sorted({text for texts in older for text in texts}))}"
         )
-
-
-def _other_versions(step: "Step") -> list[str]:
-    """How the libraries that made an existing artefact differ from those present."""
-    from irlcli.experiments import provenance
-
-    if step.artefact is None:
-        return []
-    return provenance.other_versions(step.artefact.provenance())
 
 
 @stage_command

@@ -4,13 +4,10 @@ from typing import Annotated
 
 import typer
 
-from irlcli.cli import arguments, complete
+from irlcli.cli import complete
 from irlcli.cli.options import Name, OneSetting, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.envs.registry import resolve
-from irlcli.errors import UsageError
-from irlcli.experiments.references import recorded
-from irlcli.stages import import_demonstrations as stage
+from irlcli.requests.collect import import_demonstrations
 
 
 @stage_command
@@ -54,17 +51,13 @@ def import_(
     name: Name = None,
 ) -> None:
     """Turn demonstrations recorded elsewhere into an artefact like that of collect-experts."""
-    if intervention is None and not setting:
-        raise UsageError(
-            "neither --intervention nor --setting names the settings of the episodes",
-            "give --intervention KNOB=VALUE,VALUE, or --setting default for the unchanged "
-            "environment",
-        )
-    env = resolve(env).name
-    config = session.config(env)
-    named = (
-        [] if intervention is None else arguments.named_settings(env, config, intervention, "id")
+    request = import_demonstrations(
+        session,
+        recordings=recordings,
+        env=env,
+        intervention=intervention,
+        setting=setting,
+        setting_column=setting_column,
+        cut=cut,
     )
-    settings = arguments.with_several(env, named, setting)
-    form, found = recorded(recordings)
-    session.deliver([stage.request(form, found, env, settings, setting_column, cut)], name)
+    session.deliver([request], name)

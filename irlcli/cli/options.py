@@ -129,7 +129,7 @@ def planning_command(function: Callable[..., None]) -> Callable[..., None]:
 
 def _with_options(
     function: Callable[..., None],
-    open_session: Callable[..., Session],
+    open_session: Callable[..., Session | StageSession],
     reads: bool = True,
     **fixed: object,
 ) -> Callable[..., None]:

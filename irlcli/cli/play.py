@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from irlcli.cli import arguments
 from irlcli.cli import console as out
 from irlcli.cli.options import Env, Seed, store_command
 from irlcli.cli.session import Session
@@ -16,6 +15,7 @@ from irlcli.configs import load_config
 from irlcli.errors import UsageError
 from irlcli.experiments import references
 from irlcli.interventions import Setting, check_observed, parse_setting
+from irlcli.requests import arguments
 from irlcli.stages.base import Source
 
 if TYPE_CHECKING:

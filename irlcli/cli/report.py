@@ -18,16 +18,15 @@ from irlcli.cli.experiments import (
 from irlcli.cli.options import Name, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.tables import (
-    Choice,
     check_out,
     copy_outputs,
-    open_plan,
     print_report,
     report_json,
     report_of,
 )
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import NotFound, UsageError, suggest
+from irlcli.requests.tables import Choice, open_plan
 from irlcli.store import Artefact
 
 _FORMS = ("text", "markdown", "latex")
@@ -179,6 +178,7 @@ def _table2(session: StageSession, form: str | None) -> None:
 
 def _returns(session: StageSession, refs: Sequence[str]) -> None:
     from irlcli.experiments.references import by_own_reward, circumstances, evaluation
+    from irlcli.report.returns import as_json
 
     named = [evaluation(session.store, ref) for ref in refs]
     index = session.store.index()
@@ -187,6 +187,6 @@ def _returns(session: StageSession, refs: Sequence[str]) -> None:
         for artefact, summary in named
     ]
     if session.as_json:
-        out.print_json("returns", {"rows": returns.as_json(measured)})
+        out.print_json("returns", {"rows": as_json(measured)})
     else:
         returns.print_rows(measured)

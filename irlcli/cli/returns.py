@@ -1,32 +1,9 @@
-"""Returns of evaluations, as a table or as JSON."""
+"""Returns of evaluations, as a table."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from irlcli.cli import console as out
-from irlcli.data.descriptions import Evaluation
-from irlcli.report.returns import rows
-
-# A summary, the parameters behind it that seeds share, and whether its reward is the policy's own.
-Measured = tuple[Evaluation, Mapping[str, Any], bool]
-
-
-def as_json(evaluations: Sequence[Measured]) -> list[dict[str, Any]]:
-    """A document for each agent and setting."""
-    return [
-        {
-            "agent": row.agent,
-            "env": row.env,
-            "setting": row.setting,
-            "returns": list(row.returns),
-            "mean": row.mean,
-            "std_over_seeds": row.deviation,
-            "mean_progress": row.progress,
-            "mean_learned_return": row.learned,
-            "episodes_per_seed": row.episodes,
-        }
-        for row in rows(evaluations)
-    ]
+from irlcli.report.returns import Measured, rows
 
 
 def print_rows(evaluations: Sequence[Measured], stderr: bool = False) -> None:

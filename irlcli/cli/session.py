@@ -1,62 +1,29 @@
-"""What a command works with: the store, the console, and the runner of its stages."""
+"""What a command works with: a session of its options that prints what it finds and runs."""
 
 import os
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.cli import console as out
 from irlcli.errors import NotFound
-from irlcli.store import Artefact, Store
-
-DEFAULT_STORE, DEFAULT_PROFILE = Path("runs"), "standard"
+from irlcli.requests import session as base
+from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
+from irlcli.store import Artefact
 
 if TYPE_CHECKING:
-    from irlcli.configs import Config
-    from irlcli.experiments.runner import Runner, Step
+    from irlcli.experiments.runner import Step
     from irlcli.stages.base import Request
 
 
-class Session:
+class Session(base.Session):
     """The store that a command reads, and how it prints."""
 
-    def __init__(
-        self,
-        store: Path,
-        as_json: bool = False,
-        console: out.TerminalConsole | None = None,
-        wait: bool = True,
-        read_only: bool = False,
-    ):
-        self.console = console or out.TerminalConsole()
-        self.store = Store(store, self.console.warn, read_only)
+    def __init__(self, store: Path, as_json: bool = False):
+        super().__init__(store, out.TerminalConsole())
         self.as_json = as_json
-        self.wait = wait
-
-    def reading(self) -> AbstractContextManager[None]:
-        """Keep gc from deleting anything while the command reads artefacts."""
-        return self.store.in_use(self.wait, partial(self.console.wait, "the store"))
-
-    def artefact(self, ref: str) -> Artefact:
-        """The artefact that ``ref`` names.
-
-        Raises:
-            NotFound: no such artefact, or a file outside the store.
-        """
-        resolved = self.store.resolve(ref)
-        if resolved.artefact is None:
-            raise NotFound(f"{ref!r} is a file outside the store", "`irl ls` lists the artefacts")
-        return resolved.artefact
-
-    def name(self, name: str, artefact: Artefact) -> None:
-        """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
-        before = self.store.set_name(name, artefact)
-        if before is not None:
-            self.console.warn(f"{name} no longer names {before}")
 
     def check_exists(self) -> None:
         """Refuse a store that does not exist: a mistyped path would look like an empty store.
@@ -72,8 +39,8 @@ class Session:
             )
 
 
-class StageSession(Session):
-    """A session that plans and runs stages under a profile and its overrides."""
+class StageSession(base.StageSession):
+    """A session that plans and runs stages, and prints the plan or the artefacts."""
 
     def __init__(
         self,
@@ -90,36 +57,21 @@ class StageSession(Session):
         quiet: bool,
         tensorboard: Path | None,
     ):
-        from irlcli.configs import check_profile
-
-        check_profile(profile)
         super().__init__(
-            store, as_json, out.TerminalConsole(quiet, tensorboard), wait, read_only=dry_run
+            store,
+            out.TerminalConsole(quiet, tensorboard),
+            profile=profile,
+            file=file,
+            overrides=overrides,
+            sources=sources,
+            command=["irl", *sys.argv[1:]],
+            wait=wait,
+            workers=workers,
+            read_only=dry_run,
         )
-        self.profile = profile
-        self.file = file
-        # Settings file of a table, which --settings replaces.
-        self.table_file: Path | None = None
-        self.overrides = list(overrides)
-        self.sources = list(sources)
+        self.as_json = as_json
         self.dry_run = dry_run
-        self.workers = workers
         self.tensorboard = tensorboard
-
-    def config(
-        self, env: str, flags: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
-    ) -> "Config":
-        """The config of ``env`` under this session's profile and overrides, then ``overrides``."""
-        from irlcli.configs import load_config
-
-        file = self.file or self.table_file
-        return load_config(env, self.profile, file, [*self.overrides, *overrides], flags)
-
-    def config_words(self) -> list[str]:
-        """The options that give another command line the same configs."""
-        words = ["--profile", self.profile]
-        words += [] if self.file is None else ["--settings", str(self.file)]
-        return words + [word for item in self.overrides for word in ("--set", item)]
 
     def place_words(self) -> list[str]:
         """The options that give another command line the same stores and the same way to work."""
@@ -140,28 +92,6 @@ class StageSession(Session):
         store = [] if root == known else ["--store", str(root)]
         return shlex.join(["irl", *words, *configs, *store])
 
-    def runner(self) -> "Runner":
-        """A runner on the session's store and those to copy from.
-
-        Raises:
-            NotFound: a directory given by ``--from`` is not a store.
-        """
-        from irlcli.experiments.runner import Runner
-
-        sources = []
-        if self.sources:
-            from irlcli.store.sources import open_sources
-
-            sources = open_sources(self.sources, self.console.warn)
-        return Runner(
-            self.store,
-            self.console,
-            self.wait,
-            ["irl", *sys.argv[1:]],
-            workers=self.workers,
-            sources=sources,
-        )
-
     def deliver(
         self,
         requests: Sequence["Request"],
@@ -178,24 +108,13 @@ class StageSession(Session):
         Returns:
             the artefacts; none with ``--dry-run``.
         """
-        if name is not None:
-            # A bad name must fail before the work, not after it.
-            self.store.check_name(name)
-        runner = self.runner()
         if self.dry_run:
+            if name is not None:
+                self.store.check_name(name)
+            runner = self.runner()
             self.print_plan([step for request in requests for step in runner.plan(request)])
             return []
-        artefacts = []
-        # In a new store, too, gc must not delete an artefact before it has its name.
-        self.store.create()
-        with self.reading():
-            try:
-                for request in requests:
-                    artefacts.append(runner.run(request))
-            finally:
-                self.console.close()
-            if name is not None:
-                self.name(name, artefacts[0])
+        artefacts = self.run(requests, name)
         for artefact in artefacts:
             self.print_artefact(artefact, name, details)
         return artefacts
@@ -205,15 +124,11 @@ class StageSession(Session):
 
         With ``--dry-run`` None if it is missing; the printed plan then shows ``then`` as blocked.
         """
+        if not self.dry_run:
+            return super().prepare(request, then)
         from irlcli.experiments.runner import Step
 
-        runner = self.runner()
-        if not self.dry_run:
-            try:
-                return runner.run(request)
-            finally:
-                self.console.close()
-        steps = runner.plan(request)
+        steps = self.runner().plan(request)
         if steps[-1].artefact is None:
             self.print_plan([*steps, Step("BLOCKED", then, f"waits for {request.label}")])
         return steps[-1].artefact

@@ -1,86 +1,19 @@
-"""A chosen part of a table of ``settings/experiments.toml``: its plan and its report."""
+"""The report on a table of ``settings/experiments.toml``: its request, its text, its files."""
 
-import re
 import shlex
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from irlcli.cli import arguments
 from irlcli.cli import console as out
 from irlcli.cli.session import StageSession
-from irlcli.errors import StageFailed, UsageError, suggest
+from irlcli.errors import StageFailed, UsageError
+from irlcli.requests.tables import Choice
 from irlcli.store import Artefact, read_json
 
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
     from irlcli.stages.base import Request
-
-
-class Choice(NamedTuple):
-    """The options that choose a part of a table."""
-
-    table: str
-    seeds: str | None = None
-    methods: str | None = None
-    env: str | None = None
-    choose_penalty: str | None = None
-    until: str | None = None
-    only: str | None = None
-    tag: str | None = None
-    file: Path | None = None
-
-    def words(self) -> list[str]:
-        """The options that make the same choice of rows and runs on another command line."""
-        listed = {
-            "--seeds": self.seeds,
-            "--methods": self.methods,
-            "--env": self.env,
-            "--choose-penalty": self.choose_penalty,
-            "--experiments": self.file,
-        }
-        return [
-            word for o, value in listed.items() if value is not None for word in (o, str(value))
-        ]
-
-
-def open_plan(session: StageSession, choice: Choice) -> "Plan":
-    """The plan of the chosen part of a table. The table's settings file becomes the session's.
-
-    Raises:
-        UsageError: an unknown table, row, method, phase or step, or another bad option.
-    """
-    from irlcli.experiments.plan import Plan, Selection
-    from irlcli.experiments.rows import PHASES
-    from irlcli.experiments.tables import load_table, narrowed
-
-    table = load_table(choice.table, choice.file)
-    table = narrowed(
-        table,
-        None if choice.methods is None else _words(choice.methods),
-        None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
-        arguments.row_env(choice.env),
-    )
-    until = PHASES[-1] if choice.until is None else choice.until
-    if until not in PHASES:
-        raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
-    candidates: Sequence[float] | Literal["own"] = ()
-    if choice.choose_penalty is not None:
-        if table.kind != "comparison" or table.variants:
-            raise UsageError(f"{table.name} takes no --choose-penalty", "omit --choose-penalty")
-        candidates = arguments.weights(choice.choose_penalty)
-    tag = choice.tag or (table.name if table.settings else session.profile)
-    session.table_file = table.settings
-    selection = Selection(tag, candidates, until, choice.only)
-    plan = Plan(table, selection, session.config, session.runner().lookup())
-    for name in plan.tasks:
-        session.store.check_name(name)
-    return plan
-
-
-def _words(text: str) -> list[str]:
-    return [word for word in re.split(r"[,\s]+", text) if word]
 
 
 def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":

@@ -2,10 +2,9 @@
 
 from typing import Annotated, Any
 
-import msgspec
 import typer
 
-from irlcli.cli import arguments, complete
+from irlcli.cli import complete
 from irlcli.cli import console as out
 from irlcli.cli.options import (
     Env,
@@ -19,16 +18,8 @@ from irlcli.cli.options import (
 )
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Quality
-from irlcli.errors import UsageError
-from irlcli.experiments.references import demonstrations, output
-from irlcli.experiments.runner import source_of
-from irlcli.interventions import check_tabular, parse_setting
-from irlcli.methods import METHODS
-from irlcli.stages import choose_penalty as choice
-from irlcli.stages import clone as clone_stage
-from irlcli.stages import train_airl as airl_stage
-from irlcli.stages import train_maxent as maxent_stage
-from irlcli.store import Resolved, read_json
+from irlcli.experiments.references import output
+from irlcli.requests import train as requested
 
 
 def _listed(learner: str) -> str:
@@ -66,54 +57,21 @@ def train_airl(
     name: Name = None,
 ) -> None:
     """Learn a reward and a student policy from demonstrations."""
-    known = arguments.env_name(env)
-    source, env, texts = demonstrations(session.store, demos)
-    arguments.check_env(demos, env, known)
-    settings = [parse_setting(env, text) for text in texts]
-    if method in METHODS and not METHODS[method].learns_reward:
-        options = {
-            "--grouping": grouping,
-            "--penalty": penalty,
-            "--penalty-weight": penalty_weight,
-            "--choose-penalty": choose_penalty,
-            "--select": select,
-            "--state-only": state_only,
-        }
-        arguments.check_cloning(method, options)
-        request = clone_stage.request(source, env, settings, session.config(env), seed)
+    request = requested.train_airl(
+        session,
+        demos=demos,
+        method=method,
+        grouping=grouping,
+        penalty=penalty,
+        penalty_weight=penalty_weight,
+        choose_penalty=choose_penalty,
+        select=select,
+        state_only=state_only,
+        env=env,
+        seed=seed,
+    )
+    if request is not None:
         session.deliver([request], name)
-        return
-    flags = {
-        **arguments.method_fields("airl", method, grouping, penalty),
-        "airl.penalty_weight": penalty_weight,
-        "airl.select": str(parse_setting(env, select)) if select and "=" in select else select,
-        "airl.state_only": state_only,
-    }
-    config = session.config(env, flags)
-    airl = config.airl_of(settings[0])
-    arguments.check_weighted(airl_stage.name(airl), airl.penalty, penalty_weight)
-    # A bad option must fail before the choice of lambda, which takes long.
-    airl_stage.request(source, env, settings, airl, seed)
-    basis = {}
-    if choose_penalty is not None:
-        if penalty_weight is not None:
-            raise UsageError(
-                "--penalty-weight and --choose-penalty both set lambda", "give one of them"
-            )
-        weights = arguments.weights(choose_penalty)
-        request = choice.request(source, env, settings, airl, config.evaluation, weights, seed)
-        made = session.prepare(request, "train-airl")
-        if made is None:
-            return
-        path = session.store.open(made, "choice.json")
-        found = msgspec.convert(read_json(path), choice.Choice)
-        chosen = found.chosen
-        tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
-        tried = ",".join(f"{weight:g}" for weight in found.weights)
-        session.console.say(f"lambda {chosen:g} was the best of {tried}{tied} ({path})")
-        airl = msgspec.structs.replace(airl, penalty_weight=chosen)
-        basis["penalty choice"] = source_of(Resolved(made, path))
-    session.deliver([airl_stage.request(source, env, settings, airl, seed, basis)], name)
 
 
 @stage_command
@@ -133,20 +91,17 @@ def train_maxent(
     name: Name = None,
 ) -> None:
     """Learn a reward from demonstrations in a gridworld, exactly."""
-    source, env, texts = demonstrations(session.store, demos)
-    check_tabular(env, "train-maxent", wanted=True)
-    flags = {
-        **arguments.method_fields("maxent", method, grouping, penalty),
-        "maxent.penalty_weight": penalty_weight,
-        "maxent.l2": l2,
-        "maxent.features": features,
-    }
-    config = session.config(env, flags)
-    maxent = config.maxent
-    arguments.check_weighted(f"{maxent.grouping} MaxEnt", maxent.penalty, penalty_weight)
-    settings = [parse_setting(env, text) for text in texts]
-    unseen = arguments.unseen_settings(env, config)
-    request = maxent_stage.request(source, env, settings, unseen, maxent, seed)
+    request = requested.train_maxent(
+        session,
+        demos=demos,
+        method=method,
+        grouping=grouping,
+        penalty=penalty,
+        penalty_weight=penalty_weight,
+        l2=l2,
+        features=features,
+        seed=seed,
+    )
     artefacts = session.deliver([request], name)
     if artefacts and not session.as_json:
         _print_quality(session, artefacts[0])

@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple
 
 from irlcli.errors import UsageError, suggest
+from irlcli.methods import METHODS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -109,6 +110,17 @@ PENALTIES: dict[str, Penalty] = {
     ),
     "l2": Penalty("irlcli.penalties.l2", ("airl",), reads=(), candidates=(1e-4, 1e-3, 1e-2)),
 }
+
+
+def maxent_methods() -> list[str]:
+    """The names of the methods that MaxEnt IRL has as well: AIRL's, by penalties of its own."""
+    return [
+        method.name
+        for method in METHODS.values()
+        if method.learner == "airl"
+        and not method.sets
+        and "maxent" in PENALTIES[method.penalty].learners
+    ]
 
 
 def check_penalty(name: str, learner: str) -> None:

@@ -13,6 +13,9 @@ from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 from irlcli.report.agents import title
 
+# A summary, the parameters behind it that seeds share, and whether its reward is the policy's own.
+Measured = tuple[Evaluation, Mapping[str, Any], bool]
+
 _ORDER = ("expert", "student", "transfer", "clone", "random", "idle")
 _HINT = "a row is a sample over seeds: report runs that differ in anything else separately"
 
@@ -52,7 +55,7 @@ class Row(NamedTuple):
         return math.sqrt(squares / (len(self.returns) - 1))
 
 
-def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> list[Row]:
+def rows(evaluations: Iterable[Measured]) -> list[Row]:
     """A row per agent, method and setting: experts first, random and idle last.
 
     An agent that was scored by another reward than its own has a row for each method of such
@@ -106,6 +109,24 @@ def rows(evaluations: Iterable[tuple[Evaluation, Mapping[str, Any], bool]]) -> l
             )
         )
     return found
+
+
+def as_json(evaluations: Iterable[Measured]) -> list[dict[str, Any]]:
+    """A document for each of the :func:`rows`."""
+    return [
+        {
+            "agent": row.agent,
+            "env": row.env,
+            "setting": row.setting,
+            "returns": list(row.returns),
+            "mean": row.mean,
+            "std_over_seeds": row.deviation,
+            "mean_progress": row.progress,
+            "mean_learned_return": row.learned,
+            "episodes_per_seed": row.episodes,
+        }
+        for row in rows(evaluations)
+    ]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

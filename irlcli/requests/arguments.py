@@ -235,12 +235,11 @@ def method_fields(
     Raises:
         UsageError: an unknown method, or a method or a penalty that the learner does not have.
     """
-    from irlcli.cli.complete import maxent_methods
     from irlcli.methods import METHODS, fields
-    from irlcli.penalties import check_penalty
+    from irlcli.penalties import check_penalty, maxent_methods
 
     if method is not None and learner == "maxent":
-        offered = [name for name, _ in maxent_methods("")]
+        offered = maxent_methods()
         if method not in METHODS:
             raise UsageError(f"unknown method {method!r}", suggest(method, offered))
         if method not in offered:

@@ -1,0 +1,101 @@
+"""``collect-experts`` and ``import``: demonstrations."""
+
+from collections.abc import Iterator, Sequence
+
+from irlcli.data.descriptions import Collected
+from irlcli.envs.registry import resolve
+from irlcli.errors import UsageError
+from irlcli.experiments.references import output, recorded
+from irlcli.interventions import Setting
+from irlcli.requests import arguments
+from irlcli.requests.session import StageSession
+from irlcli.stages import collect_experts as collect_stage
+from irlcli.stages import import_demonstrations as import_stage
+from irlcli.stages.base import Request
+from irlcli.store import Artefact
+
+
+def collect_experts(
+    session: StageSession,
+    *,
+    env: str,
+    intervention: str | None,
+    setting: Sequence[str],
+    expert: Sequence[str],
+    trust: bool,
+    episodes: str | None,
+    seed: int,
+) -> Request:
+    """Demonstrations of the expert of each setting.
+
+    Raises:
+        UsageError: no setting is named, or one is malformed or named twice.
+        NotFound: no such environment or expert.
+    """
+    if intervention is None and not setting:
+        raise UsageError(
+            "neither --intervention nor --setting names a setting",
+            "give --intervention KNOB=VALUE,VALUE or --setting KNOB=VALUE,KNOB=VALUE",
+        )
+    env, settings = _settings(session, env, intervention, setting)
+    config = session.config(env)
+    listed = config.interventions.get(intervention or "")
+    counts: Sequence[int] = ()
+    if episodes is not None:
+        counts = arguments.counts(episodes)
+    elif listed is not None and not setting:
+        counts = listed.episodes
+    experts = arguments.experts(session.store, env, expert)
+    return collect_stage.request(env, settings, config, seed, counts, experts, trust)
+
+
+def missed_bars(session: StageSession, artefact: Artefact) -> Iterator[str]:
+    """A warning for each expert whose mean true return is below the config's bar."""
+    summary = output(session.store, artefact, "summary.json", Collected)
+    bar = session.config(summary.env).expert.bar
+    for row in summary.settings:
+        if bar is not None and row.mean_return < bar:
+            yield (
+                f"the expert of {summary.env} {row.setting} is below its bar: mean true return "
+                f"{row.mean_return:.0f} over {row.episodes} episodes, bar {bar:.0f}"
+            )
+
+
+def import_demonstrations(
+    session: StageSession,
+    *,
+    recordings: Sequence[str],
+    env: str,
+    intervention: str | None,
+    setting: Sequence[str],
+    setting_column: str,
+    cut: bool,
+) -> Request:
+    """Demonstrations that were recorded elsewhere.
+
+    Raises:
+        UsageError: no setting is named, or one is malformed or named twice, or the sources are of
+            several forms.
+        NotFound: no such environment or source.
+    """
+    if intervention is None and not setting:
+        raise UsageError(
+            "neither --intervention nor --setting names the settings of the episodes",
+            "give --intervention KNOB=VALUE,VALUE, or --setting default for the unchanged "
+            "environment",
+        )
+    env, settings = _settings(session, env, intervention, setting)
+    form, found = recorded(recordings)
+    return import_stage.request(form, found, env, settings, setting_column, cut)
+
+
+def _settings(
+    session: StageSession, ref: str, intervention: str | None, setting: Sequence[str]
+) -> tuple[str, list[Setting]]:
+    """The name of the environment, and the settings that are named."""
+    env = resolve(ref).name
+    config = session.config(env)
+    named: Sequence[Setting] = ()
+    if intervention is not None:
+        named = arguments.named_settings(env, config, intervention, "id")
+    return env, arguments.with_several(env, named, setting)

@@ -1,0 +1,210 @@
+"""``evaluate``: returns of policies, experts and baselines."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from irlcli import labels
+from irlcli.data.descriptions import Evaluation, Policy
+from irlcli.data.descriptions import Reward as RewardDescription
+from irlcli.envs.registry import environment
+from irlcli.errors import UsageError
+from irlcli.experiments import references
+from irlcli.interventions import Setting, check_observed, parse_setting
+from irlcli.requests import arguments
+from irlcli.requests.session import Session, StageSession
+from irlcli.stages import evaluate as stage
+from irlcli.stages.base import From, Request, Source
+from irlcli.store import Artefact
+
+if TYPE_CHECKING:
+    from irlcli.configs import Config
+
+
+class _Where(NamedTuple):
+    """``--ood`` or ``--intervention`` as given, and the texts of ``--setting``."""
+
+    text: str | None
+    kind: Literal["id", "ood"]
+    several: Sequence[str]
+
+    @property
+    def given(self) -> bool:
+        """Whether any setting is named."""
+        return self.text is not None or bool(self.several)
+
+    def settings(
+        self, env: str, config: "Config", origin: RewardDescription | Policy | None
+    ) -> list[Setting]:
+        """The named settings.
+
+        Raises:
+            UsageError: malformed, or with other observations than ``origin``'s.
+        """
+        named: Sequence[Setting] = ()
+        if self.text is not None:
+            named = arguments.named_settings(env, config, self.text, self.kind, origin)
+        return arguments.with_several(env, named, self.several, origin)
+
+
+class _Reward(NamedTuple):
+    """A learned reward that scores the episodes besides the true one."""
+
+    ref: str
+    source: Source
+    origin: RewardDescription
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Keywords of ``evaluate.request``."""
+        from irlcli.stages.train_airl import describe
+
+        label = f"{describe(self.origin.airl)} seed {self.origin.seed}"
+        return {"reward": self.source, "reward_label": label}
+
+
+def evaluate(
+    session: StageSession,
+    *,
+    policy: str | None,
+    expert: bool,
+    trained_in: str | None,
+    random: bool,
+    idle: bool,
+    reward: str | None,
+    ood: str | None,
+    intervention: str | None,
+    setting: Sequence[str],
+    env: str | None,
+    episodes: int | None,
+    seed: int,
+    name: str | None,
+) -> list[Request]:
+    """The returns of one agent; for experts a request each.
+
+    Raises:
+        UsageError: not exactly one agent, no settings, or contradictory options.
+        NotFound: no such policy or reward.
+    """
+    given = sum([policy is not None, expert, random, idle])
+    if given != 1:
+        raise UsageError(
+            f"{given or 'no'} agents are named, but one is needed",
+            "give one of --policy REF, --expert, --random, --idle",
+        )
+    if ood is not None and intervention is not None:
+        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    if trained_in is not None and not expert:
+        raise UsageError("--trained-in selects experts, but --expert is missing", "add --expert")
+    env = arguments.env_name(env)
+    where = _Where(intervention, "id", setting)
+    if ood is not None:
+        where = _Where(ood, "ood", setting)
+    scored_by = None
+    if reward is not None:
+        source, origin = references.tensor_file(session.store, reward, "reward")
+        arguments.check_env(reward, origin.env, env)
+        scored_by = _Reward(reward, source, origin)
+    if policy is not None:
+        requests = [_of_policy(session, policy, where, env, episodes, seed, scored_by)]
+    else:
+        agent: Literal["expert", "random", "idle"]
+        agent = "expert" if expert else "random" if random else "idle"
+        requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scored_by)
+    if name is not None and len(requests) > 1:
+        raise UsageError(
+            f"--name {name!r} cannot name {len(requests)} evaluations",
+            "evaluate one expert at a time to name it",
+        )
+    return requests
+
+
+def measured(session: Session, artefact: Artefact) -> tuple[Evaluation, dict[str, Any], bool]:
+    """An evaluation for :func:`irlcli.report.returns.rows`."""
+    scored = "reward" in artefact.manifest.record.inputs
+    own = scored and references.by_own_reward(artefact, session.store.index())
+    return references.evaluation(session.store, artefact.id)[1], {}, own
+
+
+def _of_policy(
+    session: StageSession,
+    policy: str,
+    where: _Where,
+    env: str | None,
+    episodes: int | None,
+    seed: int,
+    scored_by: _Reward | None,
+) -> Request:
+    source, origin = references.tensor_file(session.store, policy, "policy")
+    arguments.check_env(policy, origin.env, env)
+    config = session.config(origin.env, {"evaluation.episodes": episodes})
+    settings: Sequence[Setting]
+    if where.given:
+        settings = where.settings(origin.env, config, origin)
+    else:
+        settings = [parse_setting(origin.env, text) for text in origin.settings]
+    if scored_by is not None:
+        arguments.check_env(scored_by.ref, scored_by.origin.env, origin.env)
+        check_observed(origin.env, scored_by.origin.settings, settings)
+    label = f"{origin.agent} of {', '.join(origin.settings)}"
+    if origin.method is not None:
+        how = labels.retrained(origin.algorithm, origin.ceiling, origin.from_student)
+        label = f"{origin.agent} {origin.method} {how}".strip() + f" of seed {origin.seed}"
+    return stage.request(
+        origin.env,
+        settings,
+        config.evaluation,
+        source,
+        seed=seed,
+        policy_label=label,
+        **({} if scored_by is None else scored_by.arguments),
+    )
+
+
+def _of_agent(
+    session: StageSession,
+    agent: Literal["expert", "random", "idle"],
+    trained_in: str | None,
+    where: _Where,
+    env: str | None,
+    episodes: int | None,
+    seed: int,
+    scored_by: _Reward | None,
+) -> list[Request]:
+    if scored_by is not None:
+        env = scored_by.origin.env
+    if env is not None:
+        environment(env)
+    if env is None or not where.given:
+        missing = "--env ENV " if env is None else ""
+        raise UsageError(
+            f"--{agent} needs the settings to evaluate in",
+            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood",
+        )
+    config = session.config(env, {"evaluation.episodes": episodes})
+    origin = None if scored_by is None else scored_by.origin
+    settings = where.settings(env, config, origin)
+    score = {} if scored_by is None else scored_by.arguments
+    if agent != "expert":
+        return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **score)]
+    from irlcli.stages import train_expert
+
+    experts: list[tuple[Setting, Sequence[Setting]]]
+    if trained_in is None:
+        experts = [(setting, [setting]) for setting in settings]
+    else:
+        trained = arguments.named_settings(env, config, trained_in, "id")
+        experts = [(setting, settings) for setting in trained]
+        for setting, measured in experts:
+            check_observed(env, [str(setting)], measured)
+    return [
+        stage.request(
+            env,
+            measured,
+            config.evaluation,
+            From(train_expert.demonstrator(env, own, config), "policy.pt"),
+            seed=seed,
+            policy_label=f"expert of {own}",
+            **score,
+        )
+        for own, measured in experts
+    ]

@@ -1,0 +1,164 @@
+"""What options are read and requests are run with: a store, configs, and a console."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from irlcli.errors import NotFound
+from irlcli.store import Artefact, Store
+
+DEFAULT_STORE, DEFAULT_PROFILE = Path("runs"), "standard"
+
+if TYPE_CHECKING:
+    from irlcli.configs import Config
+    from irlcli.experiments.runner import Runner
+    from irlcli.stages.base import Request
+
+
+class Session:
+    """The store that artefacts are looked up in.
+
+    Args:
+        store: its directory.
+        console: receives progress and warnings, as :class:`irlcli.experiments.runner.Silent` does,
+            and the lines of ``say(text)``.
+        wait: wait for other processes, instead of raising Busy.
+        read_only: nothing is written to the store.
+    """
+
+    def __init__(self, store: Path, console: Any, wait: bool = True, read_only: bool = False):
+        self.console = console
+        self.store = Store(store, console.warn, read_only)
+        self.wait = wait
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Keep gc from deleting anything while artefacts are read."""
+        return self.store.in_use(self.wait, partial(self.console.wait, "the store"))
+
+    def artefact(self, ref: str) -> Artefact:
+        """The artefact that ``ref`` names.
+
+        Raises:
+            NotFound: no such artefact, or a file outside the store.
+        """
+        resolved = self.store.resolve(ref)
+        if resolved.artefact is None:
+            raise NotFound(f"{ref!r} is a file outside the store", "`irl ls` lists the artefacts")
+        return resolved.artefact
+
+    def name(self, name: str, artefact: Artefact) -> None:
+        """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
+        before = self.store.set_name(name, artefact)
+        if before is not None:
+            self.console.warn(f"{name} no longer names {before}")
+
+
+class StageSession(Session):
+    """A session that runs stages under a profile and its overrides.
+
+    Args:
+        profile, file, overrides: as for :func:`irlcli.configs.load_config`.
+        sources: other stores, to copy missing artefacts from.
+        command: the command line that artefacts record, so that a damaged one shows its repair.
+        workers: processes that step environments.
+
+    Raises:
+        UsageError: an unknown profile.
+    """
+
+    def __init__(
+        self,
+        store: Path,
+        console: Any,
+        *,
+        profile: str,
+        file: Path | None,
+        overrides: Sequence[str],
+        sources: Sequence[Path],
+        command: Sequence[str],
+        wait: bool = True,
+        workers: int = 1,
+        read_only: bool = False,
+    ):
+        from irlcli.configs import check_profile
+
+        check_profile(profile)
+        super().__init__(store, console, wait, read_only)
+        self.profile = profile
+        self.file = file
+        # Settings file of a table, which the session's own file replaces.
+        self.table_file: Path | None = None
+        self.overrides = list(overrides)
+        self.sources = list(sources)
+        self.command = list(command)
+        self.workers = workers
+
+    def config(
+        self, env: str, flags: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
+    ) -> "Config":
+        """The config of ``env`` under this session's profile and overrides, then ``overrides``."""
+        from irlcli.configs import load_config
+
+        file = self.file or self.table_file
+        return load_config(env, self.profile, file, [*self.overrides, *overrides], flags)
+
+    def config_words(self) -> list[str]:
+        """The options that give another command line the same configs."""
+        words = ["--profile", self.profile]
+        words += [] if self.file is None else ["--settings", str(self.file)]
+        return words + [word for item in self.overrides for word in ("--set", item)]
+
+    def runner(self) -> "Runner":
+        """A runner on the session's store and those to copy from.
+
+        Raises:
+            NotFound: a directory given by ``--from`` is not a store.
+        """
+        from irlcli.experiments.runner import Runner
+
+        sources = []
+        if self.sources:
+            from irlcli.store.sources import open_sources
+
+            sources = open_sources(self.sources, self.console.warn)
+        return Runner(
+            self.store,
+            self.console,
+            self.wait,
+            self.command,
+            workers=self.workers,
+            sources=sources,
+        )
+
+    def run(self, requests: Sequence["Request"], name: str | None = None) -> list[Artefact]:
+        """The artefacts of ``requests``, in this order; the first one gets the name.
+
+        Raises:
+            UsageError: a bad name, before any work.
+            IrlError: as for :meth:`irlcli.experiments.runner.Runner.run`.
+        """
+        if name is not None:
+            # A bad name must fail before the work, not after it.
+            self.store.check_name(name)
+        runner = self.runner()
+        artefacts = []
+        # In a new store, too, gc must not delete an artefact before it has its name.
+        self.store.create()
+        with self.reading():
+            try:
+                for request in requests:
+                    artefacts.append(runner.run(request))
+            finally:
+                self.console.close()
+            if name is not None:
+                self.name(name, artefacts[0])
+        return artefacts
+
+    def prepare(self, request: "Request", then: str) -> Artefact | None:
+        """The artefact of ``request``, on which the request of the stage ``then`` depends.
+
+        None if nothing may be run, and it is missing.
+        """
+        return self.run([request])[0]

@@ -1,0 +1,110 @@
+"""``plan`` and ``run``: a chosen part of a table of ``settings/experiments.toml``."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from irlcli.errors import UsageError, suggest
+from irlcli.requests import arguments
+from irlcli.requests.session import StageSession
+
+if TYPE_CHECKING:
+    from irlcli.experiments.plan import Plan
+    from irlcli.experiments.status import Step
+
+
+class Choice(NamedTuple):
+    """The options that choose a part of a table."""
+
+    table: str
+    seeds: str | None = None
+    methods: str | None = None
+    env: str | None = None
+    choose_penalty: str | None = None
+    until: str | None = None
+    only: str | None = None
+    tag: str | None = None
+    file: Path | None = None
+
+    def words(self) -> list[str]:
+        """The options that make the same choice of rows and runs on another command line."""
+        listed = {
+            "--seeds": self.seeds,
+            "--methods": self.methods,
+            "--env": self.env,
+            "--choose-penalty": self.choose_penalty,
+            "--experiments": self.file,
+        }
+        return [
+            word for o, value in listed.items() if value is not None for word in (o, str(value))
+        ]
+
+
+def open_plan(session: StageSession, choice: Choice) -> "Plan":
+    """The plan of the chosen part of a table. The table's settings file becomes the session's.
+
+    Raises:
+        UsageError: an unknown table, row, method, phase or step, or another bad option.
+    """
+    from irlcli.experiments.plan import Plan, Selection
+    from irlcli.experiments.rows import PHASES
+    from irlcli.experiments.tables import load_table, narrowed
+
+    table = load_table(choice.table, choice.file)
+    table = narrowed(
+        table,
+        None if choice.methods is None else _words(choice.methods),
+        None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
+        arguments.row_env(choice.env),
+    )
+    until = PHASES[-1] if choice.until is None else choice.until
+    if until not in PHASES:
+        raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
+    candidates: Sequence[float] | Literal["own"] = ()
+    if choice.choose_penalty is not None:
+        if table.kind != "comparison" or table.variants:
+            raise UsageError(f"{table.name} takes no --choose-penalty", "omit --choose-penalty")
+        candidates = arguments.weights(choice.choose_penalty)
+    tag = choice.tag or (table.name if table.settings else session.profile)
+    session.table_file = table.settings
+    selection = Selection(tag, candidates, until, choice.only)
+    plan = Plan(table, selection, session.config, session.runner().lookup())
+    for name in plan.tasks:
+        session.store.check_name(name)
+    return plan
+
+
+def _words(text: str) -> list[str]:
+    return [word for word in re.split(r"[,\s]+", text) if word]
+
+
+def steps_of(plan: "Plan") -> list[dict[str, Any]]:
+    """A document for each step of ``plan``.
+
+    ``other_versions`` says how the libraries that made an existing artefact differ from those
+    present.
+    """
+    documents = []
+    for name in plan.tasks:
+        step = plan.step(name)
+        documents.append(
+            {
+                "name": name,
+                "key": step.key,
+                "status": step.status,
+                "request": step.label,
+                "why": step.why,
+                "needs": list(plan.needs[name]),
+                "other_versions": _other_versions(step),
+            }
+        )
+    return documents
+
+
+def _other_versions(step: "Step") -> list[str]:
+    from irlcli.experiments import provenance
+
+    if step.artefact is None:
+        return []
+    return provenance.other_versions(step.artefact.provenance())

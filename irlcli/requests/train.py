@@ -1,0 +1,121 @@
+"""``train-airl`` and ``train-maxent``: rewards from demonstrations."""
+
+import msgspec
+
+from irlcli.errors import UsageError
+from irlcli.experiments.references import demonstrations
+from irlcli.experiments.runner import source_of
+from irlcli.interventions import check_tabular, parse_setting
+from irlcli.methods import METHODS
+from irlcli.requests import arguments
+from irlcli.requests.session import StageSession
+from irlcli.stages import choose_penalty as choice
+from irlcli.stages import clone as clone_stage
+from irlcli.stages import train_airl as airl_stage
+from irlcli.stages import train_maxent as maxent_stage
+from irlcli.stages.base import Request
+from irlcli.store import Resolved, read_json
+
+
+def train_airl(
+    session: StageSession,
+    *,
+    demos: str,
+    method: str | None,
+    grouping: str | None,
+    penalty: str | None,
+    penalty_weight: float | None,
+    choose_penalty: str | None,
+    select: str | None,
+    state_only: bool | None,
+    env: str | None,
+    seed: int,
+) -> Request | None:
+    """A reward and a student, or a behavioural clone. ``choose_penalty`` is run here.
+
+    None if lambda is to be chosen but nothing may be run.
+
+    Raises:
+        UsageError: unknown, contradictory or ineffective options.
+        NotFound: no such demonstrations.
+    """
+    known = arguments.env_name(env)
+    source, env, texts = demonstrations(session.store, demos)
+    arguments.check_env(demos, env, known)
+    settings = [parse_setting(env, text) for text in texts]
+    if method in METHODS and not METHODS[method].learns_reward:
+        options = {
+            "--grouping": grouping,
+            "--penalty": penalty,
+            "--penalty-weight": penalty_weight,
+            "--choose-penalty": choose_penalty,
+            "--select": select,
+            "--state-only": state_only,
+        }
+        arguments.check_cloning(method, options)
+        return clone_stage.request(source, env, settings, session.config(env), seed)
+    flags = {
+        **arguments.method_fields("airl", method, grouping, penalty),
+        "airl.penalty_weight": penalty_weight,
+        "airl.select": str(parse_setting(env, select)) if select and "=" in select else select,
+        "airl.state_only": state_only,
+    }
+    config = session.config(env, flags)
+    airl = config.airl_of(settings[0])
+    arguments.check_weighted(airl_stage.name(airl), airl.penalty, penalty_weight)
+    # A bad option must fail before the choice of lambda, which takes long.
+    airl_stage.request(source, env, settings, airl, seed)
+    basis = {}
+    if choose_penalty is not None:
+        if penalty_weight is not None:
+            raise UsageError(
+                "--penalty-weight and --choose-penalty both set lambda", "give one of them"
+            )
+        weights = arguments.weights(choose_penalty)
+        request = choice.request(source, env, settings, airl, config.evaluation, weights, seed)
+        made = session.prepare(request, "train-airl")
+        if made is None:
+            return None
+        path = session.store.open(made, "choice.json")
+        found = msgspec.convert(read_json(path), choice.Choice)
+        chosen = found.chosen
+        tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
+        tried = ",".join(f"{weight:g}" for weight in found.weights)
+        session.console.say(f"lambda {chosen:g} was the best of {tried}{tied} ({path})")
+        airl = msgspec.structs.replace(airl, penalty_weight=chosen)
+        basis["penalty choice"] = source_of(Resolved(made, path))
+    return airl_stage.request(source, env, settings, airl, seed, basis)
+
+
+def train_maxent(
+    session: StageSession,
+    *,
+    demos: str,
+    method: str | None,
+    grouping: str | None,
+    penalty: str | None,
+    penalty_weight: float | None,
+    l2: float | None,
+    features: str | None,
+    seed: int,
+) -> Request:
+    """A reward for the states of a gridworld.
+
+    Raises:
+        UsageError: unknown or ineffective options, or demonstrations of another environment.
+        NotFound: no such demonstrations.
+    """
+    source, env, texts = demonstrations(session.store, demos)
+    check_tabular(env, "train-maxent", wanted=True)
+    flags = {
+        **arguments.method_fields("maxent", method, grouping, penalty),
+        "maxent.penalty_weight": penalty_weight,
+        "maxent.l2": l2,
+        "maxent.features": features,
+    }
+    config = session.config(env, flags)
+    maxent = config.maxent
+    arguments.check_weighted(f"{maxent.grouping} MaxEnt", maxent.penalty, penalty_weight)
+    settings = [parse_setting(env, text) for text in texts]
+    unseen = arguments.unseen_settings(env, config)
+    return maxent_stage.request(source, env, settings, unseen, maxent, seed)

@@ -1,0 +1,69 @@
+"""``transfer``: policies on frozen rewards."""
+
+from collections.abc import Sequence
+
+from irlcli.errors import UsageError, suggest
+from irlcli.experiments import references
+from irlcli.interventions import Setting
+from irlcli.requests import arguments
+from irlcli.requests.session import StageSession
+from irlcli.stages import transfer as stage
+from irlcli.stages.base import Request
+from irlcli.stages.train_airl import describe
+
+_STARTS = ("scratch", "student")
+
+
+def transfer(
+    session: StageSession,
+    *,
+    reward: str,
+    ood: str | None,
+    intervention: str | None,
+    setting: Sequence[str],
+    algorithm: str | None,
+    start: str,
+    env: str | None,
+    seed: int,
+) -> Request:
+    """A policy that is trained on ``reward`` in one setting.
+
+    Raises:
+        UsageError: not exactly one setting, or an unknown or unsuitable option.
+        NotFound: no such reward, or no student beside it.
+    """
+    if start not in _STARTS:
+        raise UsageError(f"unknown --start {start!r}", suggest(start, _STARTS))
+    given = {"--ood": ood, "--intervention": intervention, "--setting": ",".join(setting) or None}
+    options = [option for option, text in given.items() if text is not None]
+    if len(options) != 1:
+        raise UsageError(
+            f"{' and '.join(options)} both name a setting" if options else "no setting is named",
+            "give one of --ood SETTING, --intervention SETTING, --setting KNOB=VALUE,KNOB=VALUE",
+        )
+    env = arguments.env_name(env)
+    source, origin = references.tensor_file(session.store, reward, "reward")
+    arguments.check_env(reward, origin.env, env)
+    config = session.config(origin.env, {"transfer.algorithm": algorithm})
+    named: Sequence[Setting] = ()
+    if intervention is not None:
+        named = arguments.named_settings(origin.env, config, intervention, "id", origin)
+    elif ood is not None:
+        named = arguments.named_settings(origin.env, config, ood, "ood", origin)
+    settings = arguments.with_several(origin.env, named, setting, origin)
+    if len(settings) != 1:
+        names = ", ".join(str(setting) for setting in settings)
+        raise UsageError(
+            f"{options[0]} {given[options[0]]!r} names {len(settings)} settings: {names}",
+            "transfer to one at a time",
+        )
+    label = f"{describe(origin.airl)} seed {origin.seed}"
+    return stage.request(
+        source,
+        origin.env,
+        settings[0],
+        config.transfer_of(settings[0]),
+        seed,
+        label,
+        references.student_beside(session.store, source, origin) if start == "student" else None,
+    )
