@@ -22,7 +22,7 @@ from harness import Chain, Child, Fault, command, figures, irl, must, preload, s
 
 CHEAP = ("grid", "train-maxent")
 _ENOUGH = 2000  # calls; far more than one stage makes
-_TOLERATED = 40  # calls that claims and the like make, at most
+_TOLERATED = 40  # calls that only save work, at most
 _YEAR = 365 * 86400
 
 
@@ -72,9 +72,12 @@ def killed_at_random(chain: Chain, stage: str, work: Path, wanted: int) -> tuple
 
 
 def refused_calls(
-    chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool]
+    chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool], claims: bool
 ) -> int:
-    """One kind of call fails, once or from a point on; returns the number of failed runs."""
+    """One kind of call fails, once or from a point on; returns the number of failed runs.
+
+    Those of claims and locks, which a run may survive, only if ``claims``.
+    """
     refused = 0
     for call, number in (
         ("fsync", errno.EIO),
@@ -85,11 +88,12 @@ def refused_calls(
         ("open", errno.EROFS),
     ):
         for persist in persists:
-            # What only saves work, such as a claim, may fail without failing the run.
+            # What only saves work may fail without failing the run.
             unharmed = 0
             for n in range(0, _ENOUGH, stride):
                 store = chain.fresh(stage, work / "store")
-                fault = Fault(n, number, persist, (call,))
+                spared = None if claims else store / ".locks"
+                fault = Fault(n, number, persist, (call,), spared=spared)
                 ended = irl(store, *command(stage), fault=fault)
                 chain.assert_sound(stage, store)
                 if ended.code == 0:
@@ -101,8 +105,7 @@ def refused_calls(
                 assert os.strerror(number) in ended.err and "hint: " in ended.err, ended.err
                 chain.assert_completes(stage, store)
                 refused += 1
-    # A short attack meets few calls beyond those of claims, which may fail.
-    assert refused >= (3 if stride > 6 else 6), refused
+    assert refused >= 6, refused
     return refused
 
 
@@ -192,7 +195,7 @@ def attack(part: str, chain: Chain, work: Path, short: bool) -> None:
             found, runs = killed_at_random(chain, each, work, 2 if short else 20)
             figures("crash", {f"{each}: kills at random times": found, f"{each}: runs": runs})
     elif part == "refused":
-        how = (25, (False,)) if short else (6, (False, True))
+        how = (25, (False,), False) if short else (6, (False, True), True)
         figures("crash", {"refused calls": refused_calls(chain, stage, work, *how)})
     elif part == "clock":
         figures("crash", {"clocks set": clock_set_back(chain, stage, work)})

@@ -23,6 +23,7 @@
 #include <unistd.h>
 
 static char under[PATH_MAX];
+static char beside[PATH_MAX];
 static char only[128];
 static long at = -1;
 static int action;
@@ -31,10 +32,13 @@ static long shift;
 static atomic_long seen;
 
 /* Let `n` calls pass, then kill (act = 0) or fail with errno `act`, once or from then on. `calls`
- * names the calls that count, between commas; empty for all. The time of day is moved by `seconds`. */
-void faults_arm(const char *path, long n, int act, int from_then_on, const char *calls, long seconds)
+ * names the calls that count, between commas; empty for all. Calls below `spared` do not count, unless
+ * it is empty. The time of day is moved by `seconds`. */
+void faults_arm(const char *path, long n, int act, int from_then_on, const char *calls,
+                const char *spared, long seconds)
 {
     snprintf(under, sizeof under, "%s", path);
+    snprintf(beside, sizeof beside, "%s", spared);
     snprintf(only, sizeof only, "%s", calls);
     at = n;
     action = act;
@@ -51,15 +55,20 @@ __attribute__((constructor)) static void arm_from_environment(void)
     int number;
     if (text == NULL || sscanf(text, "%63s %d %4095s", call, &number, path) != 3) return;
     snprintf(calls, sizeof calls, ",%s,", call);
-    faults_arm(path, 0, number, 1, calls, 0);
+    faults_arm(path, 0, number, 1, calls, "", 0);
 }
 
 long faults_seen(void) { return atomic_load(&seen); }
 
+static int begins(const char *path, const char *with)
+{
+    size_t length = strlen(with);
+    return length > 0 && strncmp(path, with, length) == 0;
+}
+
 static int below(const char *path)
 {
-    size_t length = strlen(under);
-    return length > 0 && path != NULL && strncmp(path, under, length) == 0;
+    return path != NULL && begins(path, under) && !begins(path, beside);
 }
 
 static int below_fd(int fd)

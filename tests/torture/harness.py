@@ -31,13 +31,17 @@ KILL = 0  # the shim's action; any other is an errno
 
 
 class Fault(NamedTuple):
-    """The call at which a fault is injected. Only ``calls`` (names) are counted; all if empty."""
+    """The call at which a fault is injected.
+
+    Only ``calls`` (names) are counted, all if empty; those below the folder ``spared`` are not.
+    """
 
     at: int = -1
     action: int = KILL
     persist: bool = False
     calls: tuple[str, ...] = ()
     clock: int = 0  # seconds added to the time of day
+    spared: Path | None = None
 
 
 class Ended(NamedTuple):
@@ -102,6 +106,7 @@ class Child:
                 fault.action,
                 int(fault.persist),
                 calls.encode(),
+                os.fsencode(fault.spared or ""),
                 ctypes.c_long(fault.clock),
             )
             try:
