@@ -281,6 +281,7 @@ CHANGED = {
     "transfer.sac.tau": 0.1,
     "transfer.sac.ent_coef": 0.1,
     "maxent.penalty": "other",
+    "maxent.penalty_warmup_iterations": 10,
     "figure2.episodes": (400, 25, 4),
     "control.labels.strengths": (0.9, 0.7),
     "control.maps.strengths": (0.9, 0.8),
@@ -439,7 +440,11 @@ IRRELEVANT = [
     (airl, {"airl.select": "last"}, ["airl.select_every", "airl.select_episodes"]),
     (airl, {"airl.select": "episodes"}, ["airl.select_episodes"]),
     (airl, {"airl.ppo.ent_coef": 0.0}, ["airl.ppo.ent_coef_schedule"]),
-    (maxent, {"maxent.penalty": "none"}, ["maxent.penalty_weight"]),
+    (
+        maxent,
+        {"maxent.penalty": "none"},
+        ["maxent.penalty_weight", "maxent.penalty_warmup_iterations"],
+    ),
     (maxent, {"maxent.penalty_weight": 0.0}, ["maxent.penalty"]),
     (maxent, {"maxent.features": "linear"}, ["maxent.hidden"]),
     (sweep, {"maxent.features": "linear"}, ["maxent.hidden"]),
@@ -494,6 +499,13 @@ def test_no_dropout_is_in_no_key():
 def test_all_columns_are_in_no_key():
     none, last = (with_field(in_use(), "airl.columns", columns) for columns in ((), (-1,)))
     assert key(airl(none)) == key(airl(in_use())) != key(airl(last))
+
+
+def test_no_warm_up_is_in_no_key():
+    path = "maxent.penalty_warmup_iterations"
+    for request_ in (maxent, sweep):
+        none, ten = (with_field(in_use(), path, count) for count in (0, 10))
+        assert key(request_(none)) == key(request_(in_use())) != key(request_(ten))
 
 
 def test_the_scaling_of_logits_with_log_pi_is_in_the_key():

@@ -6,7 +6,7 @@ one canonical value, so that requests for the same computation have the same key
 
 from collections.abc import Iterable
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
 from irlcli.configs.schema import AIRLConfig, Config, MaxEntConfig, PPOConfig, TransferConfig
@@ -183,7 +183,7 @@ def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:
     """``maxent`` without what its penalty and its features leave unused.
 
     Raises:
-        UsageError: a penalty that MaxEnt IRL does not have.
+        UsageError: a penalty that MaxEnt IRL does not have, or a warm-up that leaves it no iteration.
     """
     check_penalty(maxent.penalty, "maxent")
     if maxent.penalty == "none" or maxent.penalty_weight == 0.0:
@@ -191,9 +191,23 @@ def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:
         if maxent.grouping in ("per-setting", "shuffled"):
             # Both weigh settings equally, and only a penalty looks at the groups.
             maxent = replace(maxent, grouping="balanced")
+    maxent = replace(maxent, penalty_warmup_iterations=_warmup(maxent))
     if maxent.features == "linear":
         maxent = replace(maxent, hidden=_MAXENT.hidden)
     return maxent
+
+
+def _warmup(maxent: MaxEntConfig) -> int | UnsetType:
+    warmup = maxent.penalty_warmup_iterations
+    if maxent.penalty == "none" or not warmup:
+        return UNSET
+    if warmup >= maxent.iterations:
+        raise UsageError(
+            f"maxent.penalty_warmup_iterations = {warmup} leaves none of {maxent.iterations} "
+            "iterations with a penalty",
+            "maxent.penalty_warmup_iterations below maxent.iterations",
+        )
+    return warmup
 
 
 def _check_known(field: str, value: str, known: Iterable[str]) -> None:

@@ -309,12 +309,14 @@ class MaxEntConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     ``grouping`` and ``penalty`` are those of :class:`AIRLConfig`. The reward is an MLP's scalar
     output (``features = "learned"``) or linear in the ``inputs`` of a state. ``held_out``
-    episodes of each setting's expert measure the likelihood.
+    episodes of each setting's expert measure the likelihood. lambda is zero for the first
+    ``penalty_warmup_iterations``; none if unset.
     """
 
     grouping: Grouping = "pooled"
     penalty: str = "none"
     penalty_weight: NonNegative = 0.05
+    penalty_warmup_iterations: NonNegativeCount | UnsetType = UNSET
     l2: NonNegative = 0.0
     features: Literal["learned", "linear"] = "learned"
     inputs: Literal["one-hot", "coordinates"] = "one-hot"

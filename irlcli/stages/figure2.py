@@ -104,6 +104,7 @@ def run(job: Job) -> None:
     figure2.draw(job.output, maze, drawn, summary, figure2.curves(quality), p.seed)
     write_csv(job.output / "figure2.csv", summary)
     m = p.shared
+    warmup = m.penalty_warmup_iterations
     facts = [
         f"Datasets: {summary['datasets'].iloc[0]}, seeds from {p.seed}, each with "
         + ", ".join(f"{len(group)} episodes in {t}" for t, group in paths.items()),
@@ -111,7 +112,8 @@ def run(job: Job) -> None:
         f"slip probability {grid.p_slip:g}",
         f"Reward: {m.features}, of {m.inputs} inputs"
         + (f", {m.hidden} hidden units" if m.features == "learned" else ""),
-        f"Fit: {m.iterations} iterations of RMSProp at learning rate {m.learning_rate:g}",
+        f"Fit: {m.iterations} iterations of RMSProp at learning rate {m.learning_rate:g}"
+        + (f", the first {warmup} at lambda 0" if warmup else ""),
     ]
     (job.output / "README.md").write_text(figure2.page(summary, p.unseen, facts))
 

@@ -75,7 +75,9 @@ def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Va
 
 def shared_config(config: Config) -> MaxEntConfig:
     """The hyperparameters of all variants; what the variants replace is at its default."""
-    return relevant_maxent(replace(config.maxent, **asdict(Variant(grouping="pooled"))))
+    penalised = Variant(grouping="per-setting", penalty=PENALTIES[0], penalty_weight=1.0)
+    relevant = relevant_maxent(replace(config.maxent, **asdict(penalised)))
+    return replace(relevant, **asdict(Variant(grouping="pooled")))
 
 
 def datasets(env: str, settings_: Sequence[Setting], config: Config) -> dict[int, Request]:
@@ -196,6 +198,7 @@ def _fit(job, settings, demos, runs, rewards, state):
             horizon=horizon,
             hidden=m.hidden if m.features == "learned" else 0,
             learning_rate=m.learning_rate,
+            penalty_warmup=m.penalty_warmup_iterations or 0,
         )
     if state is not None:
         with tensors.fitting(job.output.parent, Exception):

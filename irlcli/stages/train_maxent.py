@@ -109,6 +109,7 @@ def run(job: Job) -> None:
             horizon=grid.horizon,
             hidden=m.hidden if m.features == "learned" else 0,
             learning_rate=m.learning_rate,
+            penalty_warmup=m.penalty_warmup_iterations or 0,
         )
     names = set(learner.state_dict())
     state = tensors.restore(job.checkpoints.load(), names, job.console.warn)

@@ -32,6 +32,7 @@ from irlcli.store import Store
 
 GROUPS = ["path-group=1", "path-group=2", "path-group=3"]
 UNSEEN = ["blocked=1", "blocked=2"]
+WARMUP = "maxent.penalty_warmup_iterations"
 METHODS = (
     ["--method", "erm"],
     ["--method", "erm", "--l2", "1e-3"],
@@ -135,6 +136,18 @@ def test_methods_differ(run, demos):
     assert len({run("train-maxent", "--demos", "demos", *m).out for m in METHODS}) == len(METHODS)
 
 
+def test_a_warm_up_changes_the_reward_only_through_the_penalty(run, demos):
+    def penalties(*changes):
+        line = [*("train-maxent", "--demos", "demos", "--method", "irm"), *changes]
+        artefact = Path(run(*line, "--penalty-weight", "100").out.strip())
+        metrics = pq.read_table(artefact / "metrics.parquet").to_pydict()
+        return metrics["iteration"], metrics["optimised_penalty"]
+
+    iterations, cold = penalties()
+    (*_, last), warm = penalties("--set", f"{WARMUP}={iterations[-1]}")
+    assert last > 0 and warm[0] == cold[0] and warm[-1] != cold[-1]
+
+
 @pytest.mark.parametrize("one, other", EQUAL, ids=str)
 def test_equal_computations_are_one_artefact(run, demos, one, other):
     first, second = (run("train-maxent", "--demos", "demos", *m) for m in (one, other))
@@ -226,6 +239,7 @@ SIZE = ["--set", "gridworld.size=1024"]
         ([*COLLECT, "path-group=1", *SIZE, "--set", "gridworld.horizon=99"], "2046 steps away"),
         ([*TRAIN, "--penalty-weight", "-1"], ">= 0.0"),
         ([*TRAIN, "--penalty-weight", "nan"], ">= 0.0"),
+        ([*TRAIN, "--method", "irm", "--set", f"{WARMUP}=1000"], "leaves none"),
         ([*TRAIN, "--l2", "inf"], "l2"),
         ([*TRAIN, "--method", "airl"], "airl"),
         ([*TRAIN, "--penalty", "ridge"], "ridge"),
