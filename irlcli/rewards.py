@@ -25,8 +25,9 @@ class LearnedReward:
         settings: the settings it was learned in.
         method, seed: how it was learned.
         observation_size: D.
-        action_size: A, or the number of actions if they are indices.
+        action_size: A, or the number of choices if actions are indices.
         discrete: whether actions are indices.
+        choices: number of choices of each of K indices; empty if an action is one index or none.
     """
 
     def __init__(self, frozen: FrozenReward, description: Any):
@@ -39,6 +40,7 @@ class LearnedReward:
         self.observation_size: int = network.observation_size
         self.action_size: int = network.action_size
         self.discrete: bool = network.discrete
+        self.choices: tuple[int, ...] = network.choices
 
     def __call__(
         self,
@@ -52,7 +54,7 @@ class LearnedReward:
         Args:
             obs, next_obs: [B, D]. After a step that ends an episode, ``next_obs`` is that episode's
                 last observation, not the first one of the next.
-            act: [B, A] vectors, or [B] indices.
+            act: [B, A] vectors, or [B] or [B, K] indices.
             done: [B] bool, whether the step terminated the episode. A time limit does not
                 terminate: pass False for it.
 
@@ -61,7 +63,10 @@ class LearnedReward:
         """
         from irlcli.trajectories import Transitions
 
-        kind = np.int64 if self.discrete else np.float32
+        kind: type = np.float32
+        action: tuple[int, ...] = (self.action_size,)
+        if self.discrete:
+            kind, action = np.int64, (len(self.choices),) if self.choices else ()
         observations = np.ascontiguousarray(obs, dtype=np.float32)
         size = len(observations)
         data = Transitions(
@@ -73,7 +78,7 @@ class LearnedReward:
         )
         wanted = {
             "obs": (data.observations, (size, self.observation_size)),
-            "act": (data.actions, (size,) if self.discrete else (size, self.action_size)),
+            "act": (data.actions, (size, *action)),
             "next_obs": (data.next_observations, (size, self.observation_size)),
             "done": (data.terminated, (size,)),
         }
@@ -96,6 +101,7 @@ class LearnedReward:
             "obs": self.observation_size,
             "act": self.action_size,
             "discrete": self.discrete,
+            "choices": list(self.choices),
         }
 
 

@@ -188,12 +188,21 @@ class ActionSpace(NamedTuple):
     """The actions of an environment.
 
     Attributes:
-        discrete: whether an action is an index.
-        size: number of actions if discrete, else the length A of an action vector.
+        discrete: whether an action is an index, or several.
+        size: length of an action as a vector: A, or the number of choices of all indices.
         low, high: bounds [A] float32 of continuous actions; empty if discrete.
+        choices: number of choices of each of several indices; empty if there is one.
     """
 
     discrete: bool
     size: int
     low: np.ndarray
     high: np.ndarray
+    choices: tuple[int, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of an action: (), or (K,) for K indices, or (A,)."""
+        if self.discrete:
+            return (len(self.choices),) if self.choices else ()
+        return (self.size,)

@@ -24,7 +24,8 @@ from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.interventions import MAX_SETTING_LENGTH, Setting
 from irlcli.trajectories import Trajectory
 
-# Version 2 is version 1 without the columns reward and return: the true reward is unknown.
+# Version 2 may be without the columns reward and return (the true reward is unknown), and an action may
+# be several indices. What version 1 can hold is written as version 1.
 SCHEMA = 2
 STEPS = "steps.parquet"
 EPISODES = "episodes.parquet"
@@ -69,8 +70,8 @@ def write_demonstrations(
         raise ValueError("no trajectory to write")
     first = episodes[0][1]
     size = first.observations.shape[1]
-    tags = file_metadata(env, metadata)
-    schema = steps_schema(size, None if first.actions.ndim == 1 else first.actions.shape[1])
+    schema = steps_schema(size, action_type(first.actions))
+    tags = file_metadata(env, metadata, schema)
     schema = schema.with_metadata(tags)
     with writer(directory / STEPS, schema) as file:
         for index, (_, trajectory) in enumerate(episodes):
@@ -80,19 +81,23 @@ def write_demonstrations(
     write_table(pa.Table.from_pylist(rows, schema=schema), directory / EPISODES)
 
 
-def file_metadata(
-    env: str, metadata: Mapping[str, Any], rewarded: bool = True
-) -> dict[bytes, bytes]:
-    """The key-value metadata of both files."""
-    tags = {"schema": 1 if rewarded else 2, "env": env, **metadata}
+def file_metadata(env: str, metadata: Mapping[str, Any], steps: pa.Schema) -> dict[bytes, bytes]:
+    """The key-value metadata of both files, of which one has the columns ``steps``."""
+    action = steps.field("action").type
+    several = pa.types.is_fixed_size_list(action) and pa.types.is_integer(action.value_type)
+    version = 1 if "reward" in steps.names and not several else 2
+    tags = {"schema": version, "env": env, **metadata}
     return {_METADATA_KEY: json.dumps(tags, sort_keys=True).encode()}
 
 
-def steps_schema(
-    observation_size: int, action_size: int | None, rewarded: bool = True
-) -> pa.Schema:
-    """The columns of ``steps.parquet``; no ``action_size``: actions are indices."""
-    action = pa.int64() if action_size is None else pa.list_(pa.float32(), action_size)
+def action_type(actions: np.ndarray) -> pa.DataType:
+    """The type of the column of ``actions``: [B] or [B, K] int64, or [B, A] float32."""
+    number = pa.from_numpy_dtype(actions.dtype)
+    return number if actions.ndim == 1 else pa.list_(number, actions.shape[1])
+
+
+def steps_schema(observation_size: int, action: pa.DataType, rewarded: bool = True) -> pa.Schema:
+    """The columns of ``steps.parquet``."""
     return _schema(
         episode=pa.int32(),
         t=pa.int32(),
@@ -223,13 +228,17 @@ def _check_schemas(steps: pa.Schema, episodes: pa.Schema) -> None:
     obs, action = steps.field("obs").type, steps.field("action").type
     if not pa.types.is_fixed_size_list(obs):
         raise ValueError("obs is not a fixed_size_list")
-    if not pa.types.is_integer(action) and not pa.types.is_fixed_size_list(action):
-        raise ValueError("action is neither int64 nor a fixed_size_list")
-    action_size = None if pa.types.is_integer(action) else action.list_size
+    if pa.types.is_fixed_size_list(action):
+        number = action.value_type
+        action = pa.list_(number, action.list_size)
+    else:
+        number = action
+    if number not in (pa.int64(), pa.float32()) or action == pa.float32():
+        raise ValueError("action is neither int64 nor a fixed_size_list of int64 or float")
     rewarded = "reward" in steps.names
     setting = pa.dictionary(pa.int32(), pa.string())
     for found, expected in (
-        (steps, steps_schema(obs.list_size, action_size, rewarded)),
+        (steps, steps_schema(obs.list_size, action, rewarded)),
         (episodes, episodes_schema(obs.list_size, setting, rewarded)),
     ):
         if not found.equals(expected, check_metadata=False):

@@ -49,6 +49,7 @@ class RewardNetwork(
     gamma: Discount
     shaping: bool
     columns: Columns = ()
+    choices: Annotated[tuple[Size, ...], Meta(max_length=4096)] = ()
 
 
 class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -26,7 +26,7 @@ class Steps:
         first: [B] bool, the step begins an episode.
         settings: [B] int64, index of the episode's setting.
         observations: [B, D] float32.
-        actions: [B] int64 or [B, A] float32.
+        actions: [B] or [B, K] int64, or [B, A] float32.
         rewards: [B] float64, the true reward; None if it is unknown.
         next_observations: [B, D] float32.
         terminated, truncated: [B] bool, the episode ends with this step.
@@ -225,12 +225,15 @@ class Check:
                     "check --env and the settings: a goal is part of the observation",
                 )
         found, wanted = steps.actions, self.actions
-        if wanted.discrete:
+        fits = found.shape == (len(steps), *wanted.shape)
+        if wanted.choices:
+            last = ", ".join(str(n - 1) for n in wanted.choices)
+            listed = f"{len(wanted.choices)} whole numbers from 0 to {last}"
+        elif wanted.discrete:
             listed = f"whole numbers from 0 to {wanted.size - 1}"
-            fits = found.ndim == 1 and found.dtype == np.int64
         else:
             listed = f"vectors of {wanted.size}"
-            fits = found.shape == (len(steps), wanted.size)
+        fits = fits and (found.dtype == np.int64) == wanted.discrete
         if not fits:
             kind = "whole" if found.dtype == np.int64 else "real"
             raise UsageError(
@@ -239,8 +242,9 @@ class Check:
                 "check --env",
             )
         if wanted.discrete:
-            outside = (found < 0) | (found >= wanted.size)
-            _refuse(steps, outside, f"action is not one of the {listed}", "check --env")
+            outside = (found < 0) | (found >= np.array(wanted.choices or wanted.size))
+            bad = np.any(np.reshape(outside, (len(steps), -1)), axis=1)
+            _refuse(steps, bad, f"action is not one of the {listed}", "check --env")
 
     def _check_numbers(self, steps: Steps) -> None:
         for name, array in (

@@ -13,6 +13,7 @@ from irlcli.data.demonstrations import (
     EPISODES,
     STEPS,
     Episodes,
+    action_type,
     column_array,
     episodes_schema,
     file_metadata,
@@ -60,9 +61,9 @@ def write_stream(
     if first is None:
         raise UsageError("there is no episode to write", "name a source that holds episodes")
     width, rewarded = first.observations.shape[1], first.rewards is not None
-    tags = file_metadata(env, metadata, rewarded)
-    action_size = None if first.actions.ndim == 1 else first.actions.shape[1]
-    schema = steps_schema(width, action_size, rewarded).with_metadata(tags)
+    schema = steps_schema(width, action_type(first.actions), rewarded)
+    tags = file_metadata(env, metadata, schema)
+    schema = schema.with_metadata(tags)
     table = _EpisodeTable(width, rewarded)
     with writer(directory / STEPS, schema, repeating=()) as file:
         piece: Steps | None = first

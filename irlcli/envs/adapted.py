@@ -1,7 +1,7 @@
 """An environment from outside the package, as policies and learners here see it.
 
-Observations become vectors [D] float32, continuous actions vectors [A], and the first discrete action
-is 0. What the environment itself does wrong is reported as its own mistake.
+Observations become vectors [D] float32, continuous actions vectors [A], several indices a vector [K],
+and the first discrete action is 0. What the environment itself does wrong is reported as its own mistake.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
 from irlcli.errors import StageFailed, UsageError
 
@@ -36,7 +36,8 @@ class Adapted(gymnasium.Wrapper):
         self.observation_space = _flat_observations(env.observation_space, name)
         self.action_space = _flat_actions(env.action_space, name)
         self._shape = env.action_space.shape or ()
-        self._start = env.action_space.start if isinstance(env.action_space, Discrete) else 0
+        self._dtype = env.action_space.dtype
+        self._start = getattr(env.action_space, "start", 0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         try:
@@ -48,6 +49,8 @@ class Adapted(gymnasium.Wrapper):
     def step(self, action: Any) -> Any:
         if isinstance(self.action_space, Box):
             action = np.asarray(action, np.float32).reshape(self._shape)
+        elif isinstance(self.action_space, MultiDiscrete):
+            action = np.asarray(action, self._dtype).reshape(self._shape) + self._start
         else:
             action = action + self._start
         try:
@@ -97,12 +100,15 @@ def _flat_observations(space: gymnasium.Space, name: str) -> Box:
     return Box(space.low.reshape(-1).astype(np.float32), space.high.reshape(-1).astype(np.float32))
 
 
-def _flat_actions(space: gymnasium.Space, name: str) -> Box | Discrete:
+def _flat_actions(space: gymnasium.Space, name: str) -> Box | Discrete | MultiDiscrete:
     if isinstance(space, Discrete):
         return Discrete(int(space.n))
+    if isinstance(space, MultiDiscrete):
+        return MultiDiscrete(space.nvec.reshape(-1).astype(np.int64))
     if not isinstance(space, Box):
         raise UsageError(
-            f"{name} has actions in {type(space).__name__}, but only Box and Discrete are supported",
+            f"{name} has actions in {type(space).__name__}, but only Box, Discrete and "
+            "MultiDiscrete are supported",
             "wrap the environment so that its actions are one of these",
         )
     low, high = (b.reshape(-1).astype(np.float32) for b in (space.low, space.high))

@@ -158,7 +158,7 @@ class WorkerWorlds:
             RawArray("d", self._size),
             action_shape,
             observation_shape,
-            isinstance(self.action_space, gymnasium.spaces.Discrete),
+            not isinstance(self.action_space, gymnasium.spaces.Box),
         )
         self._actions, self._observations, self._rewards = shared.views()
         # A forked process would inherit its siblings' pipe ends and keep them open, which would

@@ -207,7 +207,8 @@ def minari_directory(dataset: str) -> Path:
     Raises:
         UsageError: the name of no dataset.
     """
-    if not re.fullmatch(r"(?:[-\w]+/)*[-\w]+-v\d+", dataset):
+    # Minari takes no namespace of one character.
+    if not re.fullmatch(r"(?![^/]/[^/]*$)(?:[-\w]+/)*[-\w]+-v\d+", dataset):
         raise UsageError(
             f"{dataset!r} is not the name of a Minari dataset", "write minari:me/hopper-mass-v0"
         )

@@ -134,6 +134,7 @@ class AIRL:
             gamma=config.ppo.gamma,
             shaping=config.shaping,
             columns=config.columns or (),
+            choices=actions.choices,
         )
         torch.manual_seed(derive("discriminator", seed, -1)[0])
         self.model = RewardModel(**asdict(self.network), dropout=config.dropout or 0.0).eval()

@@ -55,7 +55,8 @@ class FrozenReward:
                 "a goal (goal-y, direction) or a cue is part of the observation: name a setting with "
                 "the same kind of intervention as in training",
             )
-        if (network.discrete, network.action_size) != (actions.discrete, actions.size):
+        theirs = (actions.discrete, actions.size, actions.choices)
+        if (network.discrete, network.action_size, network.choices) != theirs:
             raise UsageError(
                 f"the reward takes {_actions(network)}, but {where} has {_actions(actions)}",
                 "a reward belongs to the environment it was learned in",
@@ -120,4 +121,6 @@ class FrozenReward:
 def _actions(described: Any) -> str:
     """A reward network's or an environment's actions in words."""
     size = getattr(described, "action_size", None) or described.size
+    if described.choices:
+        return f"discrete actions of {' x '.join(map(str, described.choices))} choices"
     return f"{size} discrete actions" if described.discrete else f"actions of size {size}"

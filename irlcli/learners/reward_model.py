@@ -19,8 +19,8 @@ class RewardModel(nn.Module):
 
     Args:
         observation_size: D.
-        action_size: A; the number of actions if they are discrete (fed as one-hot).
-        discrete: whether actions are int64 indices [B] or float32 vectors [B, A].
+        action_size: A; the number of choices if actions are discrete (fed as one-hot).
+        discrete: whether actions are int64 indices [B] or [B, K], or float32 vectors [B, A].
         state_only: g(s) instead of g(s, a).
         hidden: widths of the hidden layers of g and of h.
         activation: ``tanh`` or ``relu``.
@@ -28,9 +28,11 @@ class RewardModel(nn.Module):
         shaping: whether f has a shaping term; otherwise f is g.
         columns: the entries of an observation that g and h see; all if there are none.
         dropout: probability that a hidden unit is left out in training; see :meth:`train`.
+        choices: number of choices of each of K indices, in sum ``action_size``; empty if there is
+            one.
 
     Raises:
-        ValueError: an observation has no such column.
+        ValueError: an observation has no such column, or other choices.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class RewardModel(nn.Module):
         shaping: bool = True,
         columns: Sequence[int] = (),
         dropout: float = 0.0,
+        choices: Sequence[int] = (),
     ):
         super().__init__()
         self.action_size = action_size
@@ -52,6 +55,10 @@ class RewardModel(nn.Module):
         self.state_only = state_only
         self.gamma = gamma
         self.normaliser = ObservationNormaliser(observation_size)
+        self.choices = tuple(choices) or (action_size,)
+        self.several = bool(choices)
+        if sum(self.choices) != action_size or (choices and not discrete):
+            raise ValueError(f"choices {list(choices)} are not those of {action_size} actions")
         self.columns = list(columns)
         if any(not -observation_size <= column < observation_size for column in columns):
             raise ValueError(
@@ -62,10 +69,16 @@ class RewardModel(nn.Module):
         self.h = mlp(seen, hidden, activation, dropout) if shaping else None
 
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
-        """Actions as vectors [B, A]: one-hot if discrete."""
-        if self.discrete:
-            return nn.functional.one_hot(actions, self.action_size).float()
-        return actions
+        """Actions as vectors [B, A]: one-hot if discrete, those of several indices side by side."""
+        if not self.discrete:
+            return actions
+        indices = self.indices(actions)
+        return torch.cat([nn.functional.one_hot(*part) for part in indices], -1).float()
+
+    def indices(self, actions: torch.Tensor) -> list[tuple[torch.Tensor, int]]:
+        """Each index [B] of discrete ``actions`` [B] or [B, K], and its number of choices."""
+        parts = actions.unbind(-1) if self.several else (actions,)
+        return list(zip(parts, self.choices, strict=True))
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """g [B] for observations [B, D] and encoded actions [B, A]."""

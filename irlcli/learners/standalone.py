@@ -51,7 +51,7 @@ class StandaloneReward(nn.Module):
 
         Args:
             observations, next_observations: [B, D] float32.
-            actions: [B, A] float32, or [B] int64 indices.
+            actions: [B, A] float32, or [B] or [B, K] int64 indices.
             terminated: [B] bool; a time limit is no termination.
         """
         pay = self.model.reward(observations, self._encoded(actions)).clamp(max=self._ceiling)
@@ -64,7 +64,8 @@ class StandaloneReward(nn.Module):
     def _encoded(self, actions: torch.Tensor) -> torch.Tensor:
         if self.model.discrete:
             # one_hot() of any batch size cannot be exported: it looks at the largest index.
-            return (actions[:, None] == torch.arange(self.model.action_size)).float()
+            indices = self.model.indices(actions)
+            return torch.cat([part[:, None] == torch.arange(n) for part, n in indices], -1).float()
         if self.low is None or self.high is None:
             return actions
         return actions.clamp(self.low, self.high)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.distributions import (
     Distribution,
+    MultiCategoricalDistribution,
     SquashedDiagGaussianDistribution,
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -59,16 +60,22 @@ class Policy:
         return observation_size(self.network.observation_space)
 
     def act(self, observations: np.ndarray, deterministic: bool = False) -> np.ndarray:
-        """Actions [N] or [N, A] for observations [N, D]; samples by torch's global generator."""
+        """Actions [N], [N, K] or [N, A] for observations [N, D].
+
+        Samples are drawn from torch's global generator.
+        """
         with torch.no_grad():
             found = self.network.get_distribution(torch.as_tensor(observations))
-            actions = found.mode() if deterministic else _torch_distribution(found).sample()
+            actions = found.mode() if deterministic else _sample(found)
             return actions.numpy()
 
     def log_prob(
         self, observations: torch.Tensor, actions: torch.Tensor, gradient: bool = False
     ) -> torch.Tensor:
-        """log pi(a|s) [B] for observations [B, D] and actions [B] or [B, A]."""
+        """log pi(a|s) [B] for observations [B, D] and actions [B], [B, K] or [B, A].
+
+        K indices are chosen independently of each other: their log-probabilities add up.
+        """
         with torch.set_grad_enabled(gradient):
             return self.network.get_distribution(observations).log_prob(actions)
 
@@ -125,6 +132,12 @@ def _torch_distribution(found: Distribution) -> torch.distributions.Distribution
     """Torch's distribution inside SB3's: its samples need no gSDE noise matrix."""
     assert isinstance(found.distribution, torch.distributions.Distribution)
     return found.distribution
+
+
+def _sample(found: Distribution) -> torch.Tensor:
+    if isinstance(found, MultiCategoricalDistribution):
+        return found.sample()
+    return _torch_distribution(found).sample()
 
 
 def describe(config: PPOConfig | SACConfig) -> PolicyNetwork:

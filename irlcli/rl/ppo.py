@@ -185,6 +185,8 @@ class PPOTrainer:
         actions = buffer.actions.copy()
         if isinstance(model.action_space, gymnasium.spaces.Discrete):
             actions = actions[..., 0].astype(np.int64)
+        elif isinstance(model.action_space, gymnasium.spaces.MultiDiscrete):
+            actions = actions.astype(np.int64)
         return self._venv.rollout(
             buffer.observations.copy(), actions, buffer.log_probs.copy(), self._last_observations
         )

@@ -7,9 +7,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Discrete, MultiDiscrete
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 
-# reward(obs [B, D], act [B, A] or [B], next_obs [B, D], done [B]) -> [B]
+# reward(obs [B, D], act [B], [B, K] or [B, A], next_obs [B, D], done [B]) -> [B]
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -40,7 +41,7 @@ class RewardWrapper(gymnasium.Wrapper):
         following = _flat(observation)
         learned = self._reward(
             self._observation[None],
-            _vectors(np.asarray(action)[None]),
+            _vectors(np.asarray(action)[None], self.action_space),
             following[None],
             np.array([terminated]),
         )
@@ -88,7 +89,8 @@ class RewardVecEnvWrapper(VecEnvWrapper):
         for world in np.flatnonzero(dones):
             successors[world] = _flat(infos[world]["terminal_observation"])
             terminated[world] = not infos[world].get("TimeLimit.truncated", False)
-        learned = self._reward(self._observations, _vectors(self._actions), successors, terminated)
+        actions = _vectors(self._actions, self.action_space)
+        learned = self._reward(self._observations, actions, successors, terminated)
         self._observations = following
         return observations, learned.astype(np.float32), dones, infos
 
@@ -97,8 +99,10 @@ def _flat(observation: Any) -> np.ndarray:
     return np.asarray(observation, dtype=np.float32).reshape(-1)
 
 
-def _vectors(actions: np.ndarray) -> np.ndarray:
-    """Actions [B] or [B, A], whatever the shape of one is."""
+def _vectors(actions: np.ndarray, space: gymnasium.Space) -> np.ndarray:
+    """Actions [B], [B, K] or [B, A], whatever the shape of one is; the first index is 0."""
+    if isinstance(space, Discrete | MultiDiscrete):
+        actions = actions - space.start
     return actions.reshape(len(actions), -1) if actions.ndim > 2 else actions
 
 

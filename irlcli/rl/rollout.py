@@ -123,18 +123,17 @@ def _run_batch(worlds, policy, seeds, limit, deterministic, noise, rng) -> list[
 
 
 def _action_dtype(space: gymnasium.Space) -> type:
-    return np.int64 if isinstance(space, gymnasium.spaces.Discrete) else np.float32
+    return np.float32 if isinstance(space, gymnasium.spaces.Box) else np.int64
 
 
 def _random_actions(space: gymnasium.Space, count: int, rng: np.random.Generator) -> np.ndarray:
     if isinstance(space, gymnasium.spaces.Discrete):
         return rng.integers(space.n, size=count)
+    if isinstance(space, gymnasium.spaces.MultiDiscrete):
+        return rng.integers(space.nvec, size=(count, *space.shape))
     assert isinstance(space, gymnasium.spaces.Box)
     return rng.uniform(space.low, space.high, size=(count, *space.shape)).astype(np.float32)
 
 
 def _idle_actions(space: gymnasium.Space, count: int) -> np.ndarray:
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return np.zeros(count, dtype=np.int64)
-    assert isinstance(space, gymnasium.spaces.Box)
-    return np.zeros((count, *space.shape), dtype=np.float32)
+    return np.zeros((count, *(space.shape or ())), dtype=_action_dtype(space))

@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from stable_baselines3 import DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -51,7 +51,7 @@ class SavedPolicy(Policy):
         self._greedy = isinstance(model, TD3 | DQN)
 
     def act(self, observations: np.ndarray, deterministic: bool = False) -> np.ndarray:
-        """Actions [N] or [N, A] for flat observations [N, D]; samples as :class:`Policy`."""
+        """Actions [N], [N, K] or [N, A] for flat observations [N, D]; samples as :class:`Policy`."""
         shaped = observations.reshape(-1, *self._shape).astype(self._dtype)
         if isinstance(self.network, ActorCriticPolicy):
             # SB3's predict clips the samples. Demonstrations hold them as they were drawn.
@@ -138,4 +138,6 @@ def _fit(one: gymnasium.Space, other: gymnasium.Space) -> bool:
         )
     if isinstance(one, Discrete) and isinstance(other, Discrete):
         return (int(one.n), int(one.start)) == (int(other.n), int(other.start))
+    if isinstance(one, MultiDiscrete) and isinstance(other, MultiDiscrete):
+        return one == other
     return False

@@ -37,6 +37,9 @@ def action_space(space: gymnasium.Space) -> ActionSpace:
     """What learners need to know of ``space``."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return ActionSpace(True, int(space.n), np.empty(0), np.empty(0))
+    if isinstance(space, gymnasium.spaces.MultiDiscrete):
+        choices = tuple(space.nvec.tolist())
+        return ActionSpace(True, sum(choices), np.empty(0), np.empty(0), choices)
     assert isinstance(space, gymnasium.spaces.Box)
     return ActionSpace(False, space.shape[0], space.low, space.high)
 
@@ -98,7 +101,7 @@ class RecordingVecEnv(VecEnv):
 
         Args:
             observations: [T, N, D], in which the policy acted.
-            actions: [T, N] or [T, N, A], its samples.
+            actions: [T, N], or [T, N, K] or [T, N, A], its samples.
             log_probs: [T, N].
             last_observations: [N, D], in which the next step begins.
         """

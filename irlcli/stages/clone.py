@@ -99,8 +99,9 @@ def run(job: Job) -> None:
         size = observation_size(worlds.observation_space)
         view = ActionView(p.actions, space)
         data = view.of(transitions(episodes, p.environment.max_episode_steps))
-        discrete = data.actions.ndim == 1
-        if data.observations.shape[1] != size or discrete != space.discrete:
+        fits = (data.actions.dtype == "int64") == space.discrete
+        fits = fits and data.actions.shape[1:] == space.shape
+        if data.observations.shape[1] != size or not fits:
             raise IntegrityError(f"the demonstrations do not fit {env} {setting}")
         clone(trainer, data, view, p.clone.epochs, p.seed)
     write_policy(

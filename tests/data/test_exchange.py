@@ -21,6 +21,7 @@ SETTINGS = parse_settings(ENV, "bounce=0.1,0.5")
 TEXTS = tuple(map(str, SETTINGS))
 HORIZON = 40
 DISCRETE = ActionSpace(True, 4, np.empty(0), np.empty(0))
+SEVERAL = ActionSpace(True, 5, np.empty(0), np.empty(0), (3, 2))
 CONTINUOUS = ActionSpace(False, 2, -np.ones(2, np.float32), np.ones(2, np.float32))
 
 
@@ -28,7 +29,7 @@ def episode(rng, length, actions=DISCRETE, ends="terminated", rewards=True, size
     """One random episode as a table of transitions."""
     obs = rng.normal(size=(length + 1, size)).astype(np.float32)
     chosen = (
-        rng.integers(4, size=length)
+        rng.integers(actions.choices or 4, size=(length, *actions.shape))
         if actions.discrete
         else rng.normal(size=(length, actions.size)).astype(np.float32)
     )
@@ -87,16 +88,15 @@ ENDS = st.sampled_from(["terminated", "truncated"])
 @settings(max_examples=40, deadline=None)
 @given(
     shapes=st.lists(st.tuples(st.integers(1, HORIZON), ENDS), min_size=2, max_size=8),
-    discrete=st.booleans(),
+    actions=st.sampled_from([DISCRETE, SEVERAL, CONTINUOUS]),
     rewards=st.booleans(),
     sizes=st.lists(st.integers(1, 50), min_size=4, max_size=4),
     seed=st.integers(0, 2**31),
 )
-def test_import_of_export_is_the_same(tmp_path_factory, shapes, discrete, rewards, sizes, seed):
+def test_import_of_export_is_the_same(tmp_path_factory, shapes, actions, rewards, sizes, seed):
     """However the steps are divided into pieces, and whatever an episode holds."""
     base = tmp_path_factory.mktemp("round")
     rng = np.random.default_rng(seed)
-    actions = DISCRETE if discrete else CONTINUOUS
     made = table([episode(rng, n, actions, ends, rewards) for n, ends in shapes])
     pq.write_table(made, base / "source.parquet")
     first, written, _ = imported(base / "first", base / "source.parquet", actions, read=sizes[0])
@@ -252,6 +252,33 @@ def test_other_observations_and_actions_than_the_environments_are_refused(tmp_pa
         pq.write_table(table(rows * 2), tmp_path / "a.parquet")
         with pytest.raises(UsageError, match=message):
             imported(tmp_path / f"{len(message)}", tmp_path / "a.parquet")
+
+
+def test_each_of_several_indices_has_choices_of_its_own(tmp_path):
+    rng = np.random.default_rng(0)
+    made = episode(rng, 3, SEVERAL)
+    for number, (chosen, message) in enumerate(
+        (
+            ([0, 2], "row 1: action is not one of the 2 whole numbers from 0 to 2, 1"),
+            ([-1, 0], "row 1: action is not one of the 2"),
+        )
+    ):
+        wrong = {**made, "action": [made["action"][0], np.array(chosen), made["action"][2]]}
+        pq.write_table(table([wrong, made]), tmp_path / "a.parquet")
+        with pytest.raises(UsageError, match=message):
+            imported(tmp_path / str(number), tmp_path / "a.parquet", SEVERAL)
+    pq.write_table(table([episode(rng, 3)] * 2), tmp_path / "a.parquet")
+    with pytest.raises(UsageError, match="row 0: action is of whole numbers, 1 number, but"):
+        imported(tmp_path / "one", tmp_path / "a.parquet", SEVERAL)
+
+
+def test_whole_numbers_are_continuous_actions_too(tmp_path):
+    rng = np.random.default_rng(0)
+    rows = [{**episode(rng, 3), "action": [[1, 0], [0, -1], [1, 1]]}] * 2
+    pq.write_table(table(rows), tmp_path / "a.parquet")
+    demos, _, _ = imported(tmp_path / "a", tmp_path / "a.parquet", CONTINUOUS)
+    (one,), _ = demos.trajectories.values()
+    assert one.actions.dtype == np.float32 and one.actions.tolist() == rows[0]["action"]
 
 
 def test_lists_of_any_arrow_type_and_nested_lists_are_vectors(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -63,11 +64,11 @@ class Expected:
         )
 
     def shaped(self, actions: np.ndarray) -> np.ndarray:
-        """``actions`` [B] or [B, 1] in the form that the environment's actions have."""
-        single = actions.ndim == 1 or actions.shape[1] == 1
-        if single and (self.actions.discrete or self.actions.size == 1):
-            return actions.reshape(-1) if self.actions.discrete else actions.reshape(-1, 1)
-        return actions
+        """``actions`` [B] or [B, A] in the form that the environment's actions have."""
+        fitting = (len(actions), *self.actions.shape)
+        if actions.size == math.prod(fitting):
+            actions = actions.reshape(fitting)
+        return actions if self.actions.discrete else actions.astype(np.float32, copy=False)
 
 
 def vectors(array: np.ndarray) -> np.ndarray:

@@ -28,7 +28,8 @@ def write_reward(path: Path, module: StandaloneReward, about: dict[str, object])
     observations, following = torch.zeros(_EXAMPLES, size), torch.zeros(_EXAMPLES, size)
     actions = torch.zeros(_EXAMPLES, model.action_size)
     if model.discrete:
-        actions = torch.zeros(_EXAMPLES, dtype=torch.int64)
+        shape = [len(model.choices)] if model.several else []
+        actions = torch.zeros(_EXAMPLES, *shape, dtype=torch.int64)
     arguments = observations, actions, following, torch.zeros(_EXAMPLES, dtype=torch.bool)
     batch = torch.export.Dim("batch")
     program = torch.export.export(module.eval(), arguments, dynamic_shapes=({0: batch},) * 4)

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from irlcli.data.demonstrations import action_type
 from irlcli.data.exchange.expected import (
     Expected,
     Place,
@@ -184,13 +185,12 @@ def write_transitions(
 
 def _schema(first: Steps, env: str) -> pa.Schema:
     obs = pa.list_(pa.float32(), first.observations.shape[1])
-    actions = first.actions
     columns = {
         "setting": pa.dictionary(pa.int32(), pa.string()),
         "episode": pa.int32(),
         "seed": pa.int64(),
         "obs": obs,
-        "action": pa.int64() if actions.ndim == 1 else pa.list_(pa.float32(), actions.shape[1]),
+        "action": action_type(first.actions),
         **({} if first.rewards is None else {"reward": pa.float64()}),
         "next_obs": obs,
         "terminated": pa.bool_(),
