@@ -65,6 +65,7 @@ def claimed(
         Busy: a live process holds it and ``wait`` is false.
     """
     token = os.urandom(16).hex()
+    patience = _Patience(wait, on_wait, what)
     while not _create(path, token):
         holder = read(path)
         if holder is None:
@@ -72,12 +73,7 @@ def claimed(
         if not holder.lives(locks_work):
             _remove(path, holder.token)
             continue
-        if not wait:
-            raise Busy(f"{holder} is working on {what}", "try again later")
-        if on_wait is not None:
-            on_wait(str(holder))
-            on_wait = None
-        time.sleep(_POLL_SECONDS)
+        patience.wait_for(holder)
     with _beating(path, token):
         yield
 
@@ -98,6 +94,7 @@ def reading(
         Busy: ``gc`` is held by a live process and ``wait`` is false.
     """
     token = os.urandom(16).hex()
+    patience = _Patience(wait, on_wait, what)
     while True:
         own = directory / unique_name(_READER)
         if not _create(own, token):
@@ -108,11 +105,21 @@ def reading(
             if holder is None or not holder.lives(locks_work):
                 yield
                 return
-        if not wait:
-            raise Busy(f"{holder} is working on {what}", "try again later")
-        if on_wait is not None:
-            on_wait(str(holder))
-            on_wait = None
+        patience.wait_for(holder)
+
+
+class _Patience:
+    """Whether to wait for a holder, and whom to tell of it once."""
+
+    def __init__(self, wait: bool, on_wait: Callable[[str], None] | None, what: str):
+        self._wait, self._on_wait, self._what = wait, on_wait, what
+
+    def wait_for(self, holder: Holder) -> None:
+        if not self._wait:
+            raise Busy(f"{holder} is working on {self._what}", "try again later")
+        if self._on_wait is not None:
+            self._on_wait(str(holder))
+            self._on_wait = None
         time.sleep(_POLL_SECONDS)
 
 
