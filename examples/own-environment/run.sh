@@ -1,16 +1,17 @@
 #!/usr/bin/env bash
-# The whole chain on the environment of cart.py, which cart.toml describes.
+# The whole chain on the environment of cart.py, which cart.toml describes, and out to other tools.
 #
 #   examples/own-environment/run.sh [DIRECTORY] [PROFILE] [OPTIONS]
 #
-# PROFILE is standard (minutes) or smoke (seconds; nothing is learned). DIRECTORY receives the store
-# and the report. OPTIONS are those of irl run, for example --seeds 0.
+# PROFILE is standard (minutes) or smoke (seconds; nothing is learned). DIRECTORY receives the store,
+# a dataset of Minari and the report. OPTIONS are those of irl run, for example --seeds 0.
 set -euo pipefail
 out=$(realpath "${1:-cart-results}")
 profile=${2:-standard}
 irl=${IRL:-irl}
+python=${PYTHON:-python3}
 cd "$(dirname "$0")"
-export IRL_STORE=$out/runs
+export IRL_STORE=$out/runs MINARI_DATASETS_PATH=$out/minari
 
 $irl envs check cart.toml
 
@@ -20,6 +21,16 @@ $irl train-airl --demos demos --method irm --name irm --profile "$profile"
 $irl transfer --reward irm --ood 4x --name moved --profile "$profile"
 $irl evaluate --policy moved --profile "$profile"
 $irl evaluate --policy moved --setting mass=4x,drag=1 --profile "$profile"
+
+# Demonstrations to Minari and back. What comes back is equal: its export has the same bytes.
+$irl export demos demos --to minari:me/cart-v0
+$irl import minari:me/cart-v0 --env cart.toml --intervention mass=1x,2x --name back
+for name in demos back; do $irl export demos "$name" --to "parquet:$out/$name.parquet"; done
+cmp "$out/demos.parquet" "$out/back.parquet"
+
+# The learned reward trains SAC of stable-baselines3.
+steps=10000; [ "$profile" = smoke ] && steps=200
+$python sac.py irm "$steps"
 
 # Or all at once, with a report: two methods, two seeds. What exists is used.
 $irl run cart --experiments tables.toml --profile "$profile" --jobs 2 --out "$out/report" "${@:3}"
