@@ -1,7 +1,7 @@
 """``irl ls``, ``show``, ``lineage`` and ``name``: what is stored."""
 
 import json
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -9,20 +9,33 @@ from irlcli import labels
 from irlcli.cli import console as out
 from irlcli.cli.options import Ref, store_command
 from irlcli.cli.session import Session
-from irlcli.store import Artefact, Index
+from irlcli.store import Artefact, Index, Store
+
+if TYPE_CHECKING:
+    from irlcli.store.remote import Remote
 
 
 @store_command
 def ls(
     session: Session,
     stage: Annotated[str | None, typer.Option(help="Only artefacts of this stage.")] = None,
+    source: Annotated[
+        str | None,
+        typer.Option("--from", help="List those of another store: a directory or a URL."),
+    ] = None,
 ) -> None:
     """List the artefacts."""
-    session.check_exists()
+    store: Store | Remote = session.store
+    if source is None:
+        session.check_exists()
+    else:
+        from irlcli.store.sources import open_sources
+
+        (store,) = open_sources([source], session.console.warn)
     names: dict[str, list[str]] = {}
-    for name, id16 in session.store.names().items():
+    for name, id16 in store.names().items():
         names.setdefault(id16, []).append(name)
-    index = session.store.index()
+    index = store.index()
     stored = list(index.artefacts.values())
     makers = {o.sha256: a.manifest.record for a in stored for o in a.manifest.outputs}
     found: list[dict[str, Any]] = [

@@ -105,7 +105,7 @@ class TerminalConsole:
             self._writer = None
         self.say(f"{'HIT' if hit else 'DONE'} {label}: {artefact.directory}")
 
-    def found(self, label: str, artefact: Artefact, where: Path) -> None:
+    def found(self, label: str, artefact: Artefact, where: Path | str) -> None:
         """An artefact was copied from the store ``where``."""
         self._close_live()
         self.say(f"FOUND {label}: {artefact.directory}, copied from {where}")

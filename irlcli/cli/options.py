@@ -2,6 +2,8 @@
 
 import functools
 import inspect
+import os
+import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -72,11 +74,11 @@ def _stage_session(
     ] = None,
     overrides: Annotated[list[str], typer.Option("--set", help="FIELD=VALUE, repeatable.")] = [],  # noqa: B006
     sources: Annotated[
-        list[Path],
+        list[str],
         typer.Option(
             "--from",
-            envvar="IRL_FROM",
-            help="Other store to copy missing artefacts from, repeatable.",
+            help="Store to copy missing artefacts from, a directory or a URL, repeatable. "
+            "[env var: IRL_FROM]",
         ),
     ] = [],  # noqa: B006
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be done.")] = False,
@@ -98,13 +100,18 @@ def _stage_session(
         profile=profile,
         file=settings,
         overrides=overrides,
-        sources=sources,
+        sources=sources or _places(os.environ.get("IRL_FROM", "")),
         dry_run=dry_run,
         wait=wait,
         workers=workers,
         quiet=quiet,
         tensorboard=tensorboard,
     )
+
+
+def _places(text: str) -> list[str]:
+    """Directories and URLs separated by ``:``, which URLs also contain."""
+    return re.findall(r"\w[\w+.-]*://[^/:]*(?::\d+)?[^:]*|[^:]+", text)
 
 
 def store_command(function: Callable[..., None]) -> Callable[..., None]:

@@ -50,7 +50,7 @@ class StageSession(base.StageSession):
         profile: str,
         file: Path | None,
         overrides: Sequence[str],
-        sources: Sequence[Path],
+        sources: Sequence[str],
         dry_run: bool,
         wait: bool,
         workers: int,

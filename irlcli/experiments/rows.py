@@ -103,9 +103,9 @@ class Chosen(NamedTuple):
     def weight(self, choice: Request) -> float | None:
         """The lambda that ``choice`` led to; None if it was not made yet."""
         made = self.lookup(choice).artefact
-        if made is None:
+        path = self.lookup.file(choice, "choice.json")
+        if made is None or path is None:
             return None
-        path = made.directory / "choice.json"
         if file_digest(path) != made.output("choice.json").sha256:
             # What needs it reports the damage when it reads the file.
             return None

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed
 from irlcli.experiments import provenance
@@ -17,6 +17,9 @@ from irlcli.experiments.introduce import described
 from irlcli.experiments.status import Lookup, Step, key_record, source_in, source_of
 from irlcli.stages.base import Console, From, Job, Request, Source
 from irlcli.store import Artefact, KeyRecord, Resolved, Store
+
+if TYPE_CHECKING:
+    from irlcli.store.sources import Place
 
 __all__ = ["Runner", "Silent", "Step", "source_of"]
 
@@ -41,7 +44,7 @@ class Silent(Console):
     def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
         pass
 
-    def found(self, label: str, artefact: Artefact, where: Path) -> None:
+    def found(self, label: str, artefact: Artefact, where: Path | str) -> None:
         pass
 
     def wait(self, label: str, holder: str) -> None:
@@ -72,7 +75,7 @@ class Runner:
         command: the command line to record, so that a damaged artefact shows how to repair it.
         checkpoint_seconds: least time between two checkpoints [s].
         workers: processes that step the environments; not part of any artefact's identity.
-        sources: read-only stores. What one of them holds is copied from there, not computed.
+        sources: stores, on disk or behind URLs, that are only read. What one of them holds is copied from there, not computed.
     """
 
     def __init__(
@@ -83,7 +86,7 @@ class Runner:
         command: list[str] | None = None,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
         workers: int = 1,
-        sources: Sequence[Store] = (),
+        sources: "Sequence[Place]" = (),
     ):
         self.store = store if isinstance(store, Store) else Store(store)
         self.console = console if console is not None else Silent()
@@ -179,7 +182,7 @@ class Runner:
             self.console.found(request.label, artefact, where)
             return artefact
 
-    def _adopt(self, record: KeyRecord) -> tuple[Artefact, Path] | None:
+    def _adopt(self, record: KeyRecord) -> tuple[Artefact, Path | str] | None:
         """A verified copy of the artefact, and the source that has it; None if none has."""
         if not self.sources:
             return None

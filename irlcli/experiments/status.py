@@ -1,6 +1,7 @@
 """What a store holds of a request: planning without computing, writing or moving anything."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import msgspec
@@ -19,7 +20,7 @@ from irlcli.store import (
 )
 
 if TYPE_CHECKING:
-    from irlcli.store.sources import Found
+    from irlcli.store.sources import Found, Place
 
 Status = Literal["HIT", "FOUND", "RUN", "RESUME", "BLOCKED"]
 STATUSES: tuple[Status, ...] = ("HIT", "FOUND", "RUN", "RESUME", "BLOCKED")
@@ -49,10 +50,10 @@ class Lookup:
 
     Args:
         store: where artefacts are looked up first. It may be read-only or not exist yet.
-        sources: read-only stores that are looked into on a miss.
+        sources: stores, on disk or behind URLs, that are only read: they are looked into on a miss.
     """
 
-    def __init__(self, store: Store, sources: Sequence[Store] = ()):
+    def __init__(self, store: Store, sources: "Sequence[Place]" = ()):
         self.store = store
         self._sources = sources
         # By identity. The request is kept, so that no other object can get its id.
@@ -74,6 +75,14 @@ class Lookup:
         steps: dict[str, Step] = {}
         self._walk(request, steps)
         return list(steps.values())
+
+    def file(self, request: Request, path: str) -> Path | None:
+        """An output of ``request``, unchecked, also of another store; None if it was not made."""
+        step = self(request)
+        if step.artefact is None:
+            return None
+        found = self._elsewhere.get(step.key) if step.status == "FOUND" and step.key else None
+        return (self.store if found is None else found.store).file(step.artefact, path)
 
     def forget_missing(self) -> None:
         """Look again for everything that was not in the store."""

@@ -60,7 +60,7 @@ class StageSession(Session):
 
     Args:
         profile, file, overrides: as for :func:`irlcli.configs.load_config`.
-        sources: other stores, to copy missing artefacts from.
+        sources: other stores, directories or URLs, to copy missing artefacts from.
         command: the command line that artefacts record, so that a damaged one shows its repair.
         workers: processes that step environments.
 
@@ -76,7 +76,7 @@ class StageSession(Session):
         profile: str,
         file: Path | None,
         overrides: Sequence[str],
-        sources: Sequence[Path],
+        sources: Sequence[str | Path],
         command: Sequence[str],
         wait: bool = True,
         workers: int = 1,
@@ -114,7 +114,7 @@ class StageSession(Session):
         """A runner on the session's store and those to copy from.
 
         Raises:
-            NotFound: a directory given by ``--from`` is not a store.
+            NotFound: what ``--from`` names is not a store.
         """
         from irlcli.experiments.runner import Runner
 

@@ -150,9 +150,14 @@ def is_prefix(text: str) -> bool:
     return re.fullmatch(_PREFIX, text) is not None
 
 
+def is_key(text: str) -> bool:
+    """Whether ``text`` is a key: 64 hexadecimal digits."""
+    return re.fullmatch(_KEY, text) is not None
+
+
 def is_name(text: str) -> bool:
-    """Whether ``text`` has the form of a name."""
-    return re.fullmatch(_NAME, text) is not None
+    """Whether ``text`` has the form of a name: not that of an id's beginning."""
+    return re.fullmatch(_NAME, text) is not None and not is_prefix(text)
 
 
 def claims(layout: Layout) -> Iterator[tuple[Path, str]]:
@@ -161,7 +166,7 @@ def claims(layout: Layout) -> Iterator[tuple[Path, str]]:
         return
     for path in layout.keys.iterdir():
         id16 = pointed_to(path)
-        if re.fullmatch(_KEY, path.name) and id16 is not None:
+        if is_key(path.name) and id16 is not None:
             yield path, id16
 
 

@@ -20,7 +20,7 @@ MANIFEST = "manifest.json"
 PROVENANCE = "provenance.json"
 _SHA = r"[0-9a-f]{64}"
 # Far larger than real files; anything larger is an accident or an attack.
-_MAX_JSON_BYTES = 16 << 20
+MAX_JSON_BYTES = 16 << 20
 # Every file system allows this, so checking a path never fails because of its length.
 _MAX_PATH_BYTES = 200
 
@@ -117,8 +117,8 @@ def read_json(path: Path) -> Any:
     try:
         if path.is_symlink() or not path.is_file():
             raise IntegrityError(f"{path} is missing or not a regular file")
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            raise IntegrityError(f"{path} is larger than {_MAX_JSON_BYTES >> 20} MiB")
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise IntegrityError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB")
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         raise IntegrityError(f"{path} is not valid JSON ({error})") from None

@@ -64,7 +64,7 @@ def place_and_claim(
     for directory in {path.parent for path in entries(output)}:
         fsync_directory(directory)
     artefact = _place(layout, output, manifest)
-    holder = _claim(layout, manifest.record.key, artefact)
+    holder = claim(layout, artefact)
     return Published(artefact, None if holder.id == artefact.id else holder)
 
 
@@ -88,8 +88,9 @@ def _place(layout: Layout, output: Path, manifest: Manifest) -> Artefact:
     return Artefact(target, manifest)
 
 
-def _claim(layout: Layout, key: str, artefact: Artefact) -> Artefact:
-    """The artefact that holds ``key`` in the end: this one, or an earlier one."""
+def claim(layout: Layout, artefact: Artefact) -> Artefact:
+    """The artefact that holds its key in the end: this one, or an earlier one."""
+    key = artefact.manifest.record.key
     pointer = layout.keys / key
     with temporary_file(pointer, artefact.id.encode() + b"\n") as temporary:
         while True:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from irlcli.errors import NotFound, UsageError, closest
 from irlcli.store.artefact import Artefact, recorded_command
-from irlcli.store.durable import write_durably
+from irlcli.store.durable import fsync_directory, temporary_file, write_durably
 from irlcli.store.layout import (
     DEFAULT_ROOT,
     ID_DIGITS,
@@ -145,7 +145,7 @@ def check_name(name: str) -> None:
         UsageError: the name has other characters than letters, digits and ``._-``, does not
             begin with a letter, or reads as an id prefix.
     """
-    if not is_name(name) or is_prefix(name):
+    if not is_name(name):
         raise UsageError(
             f"{name!r} cannot be a name",
             "use a letter, then letters, digits, '.', '_' or '-'; hexadecimal digits alone would "
@@ -166,3 +166,25 @@ def set_name(layout: Layout, name: str, artefact: Artefact) -> str | None:
     layout.names.mkdir(exist_ok=True)
     write_durably(layout.names / name, artefact.id.encode() + b"\n")
     return before
+
+
+def claim_name(layout: Layout, name: str, artefact: Artefact) -> str | None:
+    """Point ``name`` to ``artefact`` unless it names another one; returns that one's id.
+
+    Raises:
+        UsageError: as :func:`check_name`.
+    """
+    check_name(name)
+    layout.names.mkdir(exist_ok=True)
+    pointer = layout.names / name
+    with temporary_file(pointer, artefact.id.encode() + b"\n") as temporary:
+        try:
+            os.link(temporary, pointer)
+        except FileExistsError:
+            holder = named(layout, name)
+            if holder is None:
+                # A pointer that cannot be read names nothing.
+                return set_name(layout, name, artefact)
+            return None if holder == artefact.id else holder
+    fsync_directory(layout.names)
+    return None

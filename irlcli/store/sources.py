@@ -1,39 +1,64 @@
 """Other stores, in which an artefact is looked for before it is computed (``--from``)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from irlcli.errors import NewerFormat, NotFound
 from irlcli.store.artefact import Artefact
 from irlcli.store.store import Store
 
+# A place on disk loads no fsspec.
+if TYPE_CHECKING:
+    from irlcli.store.remote import Remote
+
+    Place = Store | Remote
+
 
 class Found(NamedTuple):
     """An artefact, and the other store that has it."""
 
-    store: Store
+    store: Place
     artefact: Artefact
 
 
-def open_sources(directories: Iterable[Path | str], warn: Callable[[str], None]) -> list[Store]:
-    """The stores in ``directories``, for reading only.
+def open_place(place: Path | str, warn: Callable[[str], None], read_only: bool = False) -> Place:
+    """The store in a directory or behind a URL; it may not exist yet.
 
     Raises:
-        NotFound: a directory is not a store.
-        IntegrityError: a directory holds a newer store, or a damaged one.
-        UsageError: a path is not a directory.
+        IntegrityError: a newer store, or a damaged one.
+        UsageError: a path is not a directory, or a URL cannot be used.
+        StageFailed: a URL cannot be reached.
     """
-    stores = []
-    for directory in directories:
-        store = Store(directory, warn, read_only=True)
+    text = str(place)
+    if text.startswith("file://"):
+        text = text.removeprefix("file://")
+    elif "://" in text:
+        from irlcli.store.remote import Remote
+
+        return Remote(text, warn)
+    return Store(text, warn, read_only)
+
+
+def open_sources(places: Iterable[Path | str], warn: Callable[[str], None]) -> list[Place]:
+    """The stores at ``places``, directories or URLs, for reading only.
+
+    Raises:
+        NotFound: there is no store.
+        IntegrityError, UsageError, StageFailed: as :func:`open_place`.
+    """
+    stores: list[Place] = []
+    for place in places:
+        store = open_place(place, warn, read_only=True)
         if not store.exists():
-            raise NotFound(f"{directory} is not a store", "name a store with --from or IRL_FROM")
+            raise NotFound(f"{place} is not a store", "name a store with --from or IRL_FROM")
         stores.append(store)
     return stores
 
 
-def find_in(stores: Sequence[Store], key: str) -> Found | None:
+def find_in(stores: Sequence[Place], key: str) -> Found | None:
     """The artefact of ``key`` in the first of ``stores`` that has it; None if none has.
 
     Checks the manifest and the sizes; hashes nothing. An artefact that is damaged or of a newer

@@ -30,6 +30,9 @@ from irlcli.store.scratch import CHECKPOINT, Scratch
 if TYPE_CHECKING:
     from irlcli.store.collect import Missing
     from irlcli.store.integrity import Damage
+    from irlcli.store.manifest import Manifest, Output
+    from irlcli.store.remote import Remote
+    from irlcli.store.substitute import Advance, Origin
 
 # Stores of this process about which the user was told that their file system has no locks.
 _WITHOUT_LOCKS: set[Path] = set()
@@ -197,23 +200,62 @@ class Store:
 
         return publish(self._writable, record, output, provenance)
 
-    def adopt(self, other: Store, artefact: Artefact) -> Published | None:
+    def adopt(self, other: Store | Remote, artefact: Artefact) -> Published | None:
         """Copy an artefact and its ancestors: see :func:`irlcli.store.substitute.adopt`.
 
         To be called as :meth:`publish` is, under :meth:`in_use` and :meth:`working_on`.
         """
         from irlcli.store.substitute import adopt, ancestors
 
-        before = ancestors(artefact, other._manifests(artefact.id))
-        return adopt(self._writable, other._layout, artefact, before, self.warn)
+        before = ancestors(artefact, other.manifests(artefact.id))
+        return adopt(self._writable, other, artefact, before, self.warn)
 
-    def _manifests(self, id16: str) -> Index:
+    # Copying, as a Remote does
+
+    def manifests(self, id16: str) -> Index:
         """The sound manifests, read once: again only for an artefact that is newer than that."""
         from irlcli.store.substitute import sound_manifests
 
         if self._index is None or id16 not in self._index.artefacts:
             self._index = sound_manifests(self._layout, self.warn)
         return self._index
+
+    def file(self, artefact: Artefact, path: str) -> Path:
+        """The file of an output, unchecked."""
+        return artefact.directory / artefact.output(path).path
+
+    def contents(self, id16: str) -> tuple[Manifest, dict[str, Any]]:
+        """Manifest and provenance: see :class:`irlcli.store.substitute.Origin`."""
+        from irlcli.store.substitute import contents
+
+        return contents(self._layout, id16)
+
+    def read(self, id16: str, output: Output) -> Iterator[bytes]:
+        """The bytes of an output: see :class:`irlcli.store.substitute.Origin`."""
+        from irlcli.store import substitute
+
+        return substitute.read(self._layout, id16, output)
+
+    def holds(self, artefact: Artefact) -> bool:
+        """Whether the artefact is here with all its files. Compares sizes; hashes nothing."""
+        return not self.problems(artefact.id, quick=True)
+
+    def receive(self, source: Origin, artefact: Artefact, advance: Advance) -> None:
+        """Copy one artefact: see :func:`irlcli.store.substitute.receive`."""
+        from irlcli.store.substitute import receive
+
+        layouts.make_directories(self._writable)
+        receive(self._writable, source, artefact.id, advance)
+
+    def claim(self, artefact: Artefact) -> None:
+        """Let the artefact hold its key, unless another one does."""
+        from irlcli.store.publish import claim
+
+        claim(self._writable, artefact)
+
+    def claim_name(self, name: str, artefact: Artefact) -> str | None:
+        """Name an artefact unless another one has the name; returns that one's id."""
+        return references.claim_name(self._writable, name, artefact)
 
     # Integrity
 

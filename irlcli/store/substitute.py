@@ -1,5 +1,7 @@
 """Copying an artefact and its ancestors from another store, every byte verified.
 
+The other store is on disk or behind a URL (:mod:`irlcli.store.remote`): see :class:`Origin`.
+
 The other store is only read: nothing is locked, moved or repaired there. A damaged artefact there
 is reported and treated as missing.
 """
@@ -10,6 +12,7 @@ import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 from irlcli.errors import IntegrityError
 from irlcli.store.artefact import Artefact, Published, read_artefact
@@ -17,13 +20,37 @@ from irlcli.store.durable import unique_name
 from irlcli.store.index import Index
 from irlcli.store.integrity import problems
 from irlcli.store.layout import Layout
-from irlcli.store.manifest import Manifest, encode_provenance, read_provenance
+from irlcli.store.manifest import Manifest, Output, encode_provenance, read_provenance
 from irlcli.store.publish import place_and_claim
 from irlcli.store.read import held_by, ids
 from irlcli.store.scratch import Scratch
 
 Warn = Callable[[str], None]
+# Receives the number of bytes that were copied.
+Advance = Callable[[int], None]
 _CHUNK = 1 << 20
+
+
+class Origin(Protocol):
+    """A store that artefacts are copied from."""
+
+    @property
+    def root(self) -> Path | str:
+        """Its directory or URL."""
+
+    def contents(self, id16: str) -> tuple[Manifest, dict[str, Any]]:
+        """Manifest and provenance of an artefact, all of whose files are there with their sizes.
+
+        Raises:
+            IntegrityError: it is damaged or not whole.
+        """
+
+    def read(self, id16: str, output: Output) -> Iterator[bytes]:
+        """The bytes of an output as they are, in chunks.
+
+        Raises:
+            IntegrityError: they cannot be read.
+        """
 
 
 def sound_manifests(layout: Layout, warn: Warn) -> Index:
@@ -56,7 +83,7 @@ def ancestors(artefact: Artefact, index: Index) -> list[Artefact]:
 
 
 def adopt(
-    layout: Layout, source: Layout, artefact: Artefact, before: Sequence[Artefact], warn: Warn
+    layout: Layout, source: Origin, artefact: Artefact, before: Sequence[Artefact], warn: Warn
 ) -> Published | None:
     """Publish verified copies of the ancestors ``before`` an artefact, and of the artefact itself.
 
@@ -69,65 +96,87 @@ def adopt(
     Raises:
         OSError: the disk is full or not writable.
     """
+
+    def copied(id16: str) -> Published | None:
+        try:
+            return receive(layout, source, id16)
+        except IntegrityError as error:
+            warn(f"not copying artefact {id16} from the store {source.root}: {error.message}")
+            return None
+
     for ancestor in before:
         # Without a holder of its key, it was placed by a process that was killed before its claim.
         present = (layout.root / ancestor.id).exists()
         if not present or held_by(layout, ancestor.manifest.record.key) is None:
-            _adopt_one(layout, source, ancestor.id, warn)
-    published = _adopt_one(layout, source, artefact.id, warn)
+            copied(ancestor.id)
+    published = copied(artefact.id)
     if published is not None:
         Scratch(layout.work / artefact.manifest.record.key).clear()
     return published
 
 
-def _adopt_one(layout: Layout, source: Layout, id16: str, warn: Warn) -> Published | None:
-    # Not in the key's own working directory, where another process may be computing an ancestor.
+def receive(
+    layout: Layout, source: Origin, id16: str, advance: Advance = lambda _: None
+) -> Published:
+    """Publish a verified copy of one artefact.
+
+    Raises:
+        IntegrityError: it is damaged in ``source``; nothing is published.
+        OSError: the disk is full or not writable.
+    """
+    # Not in the key's own working directory, where another process may be computing it.
     copy = layout.work / unique_name(f"copy-{id16}")
     copy.mkdir()
     try:
-        manifest, provenance = _copy(source, id16, copy)
-        return place_and_claim(layout, copy, manifest, provenance)
-    except _Unusable as error:
-        warn(f"not copying artefact {id16} from the store {source.root}: {error}")
-        return None
+        manifest, provenance = source.contents(id16)
+        for output in manifest.outputs:
+            target = copy / output.path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with open(target, "xb") as file:
+                for chunk in verified(source, id16, output):
+                    file.write(chunk)
+                    advance(len(chunk))
+        return place_and_claim(layout, copy, manifest, encode_provenance(manifest.id, provenance))
     finally:
         shutil.rmtree(copy, ignore_errors=True)
 
 
-class _Unusable(Exception):
-    """The other store's artefact is damaged or unreadable."""
+def verified(source: Origin, id16: str, output: Output) -> Iterator[bytes]:
+    """The bytes of an output, in chunks.
+
+    The digest is of the bytes that were yielded, so a file that changes meanwhile is noticed.
+
+    Raises:
+        IntegrityError: after the last of them, if they are not the published ones.
+    """
+    hasher, left = hashlib.sha256(), output.size
+    for chunk in source.read(id16, output):
+        hasher.update(chunk)
+        left -= len(chunk)
+        # No more than was announced is written anywhere.
+        if left < 0:
+            break
+        yield chunk
+    if left != 0 or hasher.hexdigest() != output.sha256:
+        raise IntegrityError(f"{source.root}/{id16}/{output.path} differs from the published bytes")
 
 
-def _copy(source: Layout, id16: str, copy: Path) -> tuple[Manifest, bytes]:
-    """Copy the outputs of an artefact; returns its manifest and its ``provenance.json``."""
-    directory = source.root / id16
-    try:
-        # Finds damaged JSON, wrong sizes, symbolic links and unlisted files before any copying.
-        found = problems(source, id16, quick=True)
-        if found:
-            raise _Unusable(found[0])
-        manifest = read_artefact(directory).manifest
-        provenance = read_provenance(directory, manifest.id)
-    except IntegrityError as error:
-        raise _Unusable(error.message) from None
-    for output in manifest.outputs:
-        target = copy / output.path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # The digest is of the bytes written, so a file that changes meanwhile is noticed.
-        hasher = hashlib.sha256()
-        with open(target, "xb") as file:
-            for chunk in _chunks(directory / output.path):
-                hasher.update(chunk)
-                file.write(chunk)
-        if hasher.hexdigest() != output.sha256:
-            raise _Unusable(f"{directory / output.path} differs from the published bytes")
-    return manifest, encode_provenance(manifest.id, provenance)
+def contents(layout: Layout, id16: str) -> tuple[Manifest, dict[str, Any]]:
+    """:meth:`Origin.contents` of a store on disk."""
+    # Finds damaged JSON, wrong sizes, symbolic links and unlisted files before any copying.
+    found = problems(layout, id16, quick=True)
+    if found:
+        raise IntegrityError(found[0])
+    directory, manifest = read_artefact(layout.root / id16)
+    return manifest, read_provenance(directory, manifest.id)
 
 
-def _chunks(path: Path) -> Iterator[bytes]:
+def read(layout: Layout, id16: str, output: Output) -> Iterator[bytes]:
+    """:meth:`Origin.read` of a store on disk."""
+    path = layout.root / id16 / output.path
     try:
         with open(path, "rb") as file:
             while chunk := file.read(_CHUNK):
                 yield chunk
     except OSError as error:
-        raise _Unusable(f"{path} cannot be read ({error.strerror})") from None
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None

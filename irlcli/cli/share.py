@@ -1,0 +1,151 @@
+"""``irl push`` and ``irl pull``: artefacts from one store to another."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from irlcli.cli import console as out
+from irlcli.cli.options import store_command
+from irlcli.cli.session import Session
+from irlcli.errors import IntegrityError, NotFound, UsageError
+from irlcli.store import Artefact
+
+if TYPE_CHECKING:
+    from irlcli.store.sources import Place
+    from irlcli.store.substitute import Advance
+
+_Refs = Annotated[
+    list[str] | None, typer.Argument(metavar="REF...", help="Artefacts: names or id prefixes.")
+]
+_All = Annotated[bool, typer.Option("--all", help="All artefacts.")]
+_Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on stderr.")]
+
+
+@store_command
+def push(
+    session: Session,
+    refs: _Refs = None,
+    to: Annotated[str, typer.Option("--to", help="Store: a directory or a URL.")] = "",
+    everything: _All = False,
+    quiet: _Quiet = False,
+) -> None:
+    """Copy artefacts and all they were made from to a directory or URL.
+
+    What is there already is skipped. Their names go with them.
+    """
+    from irlcli.store.sources import open_place
+
+    session.check_exists()
+    place = open_place(_given(to, "--to"), session.console.warn)
+    artefacts = _chosen(session.store, refs, everything)
+    _share(session, session.store, place, artefacts, f"push to {place.root}", quiet)
+
+
+@store_command
+def pull(
+    session: Session,
+    refs: _Refs = None,
+    source: Annotated[str, typer.Option("--from", help="Store: a directory or a URL.")] = "",
+    everything: _All = False,
+    quiet: _Quiet = False,
+) -> None:
+    """Copy artefacts and all they were made from out of a directory or URL.
+
+    What is here already is skipped. Names come with them; a name that is in use here stays.
+    """
+    from irlcli.store.sources import open_sources
+
+    (place,) = open_sources([_given(source, "--from")], session.console.warn)
+    try:
+        artefacts = _chosen(place, refs, everything)
+    except NotFound as error:
+        raise NotFound(
+            f"{place.root}: {error.message}", f"`irl ls --from {place.root}` lists what is there"
+        ) from None
+    session.store.create()
+    _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet)
+
+
+def _given(place: str, option: str) -> str:
+    if not place:
+        raise UsageError(
+            f"{option} is missing", f"name a directory or a URL: {option} s3://BUCKET/PATH"
+        )
+    return place
+
+
+def _chosen(store: "Place", refs: list[str] | None, everything: bool) -> list[Artefact]:
+    """The artefacts of ``store`` that a command line names, each once."""
+    if everything == bool(refs):
+        raise UsageError("name artefacts, or give --all", "either REF... or --all")
+    if everything:
+        return list(store.index().artefacts.values())
+    found = {}
+    for ref in refs or ():
+        artefact = store.resolve(ref).artefact
+        if artefact is None:
+            raise NotFound(f"{ref!r} is a file outside the store {store.root}")
+        found[artefact.id] = artefact
+    return list(found.values())
+
+
+def _share(
+    session: Session,
+    source: "Place",
+    target: "Place",
+    artefacts: list[Artefact],
+    label: str,
+    quiet: bool,
+) -> None:
+    from irlcli.store.share import share
+
+    console = out.TerminalConsole(quiet)
+
+    def start(count: int, total: int) -> "Advance":
+        done = 0
+        if count:
+            console.start(label, resumed=False)
+
+        def advance(number: int) -> None:
+            nonlocal done
+            done += number
+            console.progress(done, total, "bytes", {})
+
+        return advance
+
+    try:
+        shared = share(source, target, artefacts, console.warn, start)
+    except IntegrityError as error:
+        error.hint = (
+            f"{error.message.partition(' ')[0]} is damaged in {source.root}: remove the artefact "
+            "there, or compute or push it again"
+        )
+        raise
+    finally:
+        console.close()
+    for name, holder in shared.taken.items():
+        console.warn(
+            f"the name {name!r} was not copied: in {target.root} it names {holder}, and keeps it"
+        )
+    where = f"{target.root}/"
+    console.say(
+        f"{_artefacts(len(shared.copied))}, {shared.bytes:,} bytes copied to {target.root}; "
+        f"{len(shared.present)} there already"
+    )
+    if session.as_json:
+        document: dict[str, Any] = {
+            "artefacts": [{"id": a.id, "path": where + a.id} for a in artefacts],
+            "copied": [a.id for a in shared.copied],
+            "present": [a.id for a in shared.present],
+            "bytes": shared.bytes,
+            "names": shared.names,
+            "names_kept": shared.taken,
+        }
+        out.print_json("shared", document)
+        return
+    for artefact in artefacts:
+        out.print_data(where + artefact.id)
+
+
+def _artefacts(count: int) -> str:
+    return f"{count} artefact" if count == 1 else f"{count} artefacts"

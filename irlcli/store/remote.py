@@ -1,0 +1,337 @@
+"""A store behind a URL, laid out like one on disk, read and written through fsspec.
+
+Manifests, names and keys are fetched when they are first needed, into a temporary directory, where
+the code for stores on disk reads and checks them. Outputs are streamed. An artefact is written with
+its manifest last, so that nobody sees what an interrupted push left.
+"""
+
+from __future__ import annotations
+
+import errno
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import Any
+
+import fsspec
+
+from irlcli.errors import IntegrityError, IrlError, NewerFormat, NotFound, StageFailed, UsageError
+from irlcli.store import layout as layouts
+from irlcli.store import references
+from irlcli.store.artefact import Artefact, read_artefact
+from irlcli.store.index import Index
+from irlcli.store.layout import FORMAT, Layout, is_id, is_key, is_name, is_prefix, pointed_to
+from irlcli.store.manifest import (
+    MANIFEST,
+    MAX_JSON_BYTES,
+    PROVENANCE,
+    Manifest,
+    Output,
+    encode_provenance,
+    read_provenance,
+)
+from irlcli.store.read import Peek
+from irlcli.store.substitute import Advance, Origin, sound_manifests, verified
+
+_CHUNK = 8 << 20
+# Small files fetched at a time. Each is at most MAX_JSON_BYTES.
+_BATCH = 32
+
+
+class Remote:
+    """The store at ``url``. What is fetched once is not fetched again.
+
+    Args:
+        url: any that fsspec knows: ``s3://bucket/path``, ``memory://name``, ...
+        warn: receives warnings about artefacts that are skipped.
+
+    Raises:
+        UsageError: the protocol is unknown or its package missing, or access is denied.
+        IntegrityError: it is a store of a newer format.
+        StageFailed: it cannot be reached.
+    """
+
+    def __init__(self, url: str, warn: Callable[[str], None]):
+        self.root = url.rstrip("/")
+        self.warn = warn
+        self._index: Index | None = None
+        self._keys: set[str] | None = None
+        with self._errors():
+            # Another process may write there at the same time: no listing is kept.
+            options = {"use_listings_cache": False, "skip_instance_cache": True}
+            self._fs, path = fsspec.core.url_to_fs(self.root, **options)
+        self._path = path.rstrip("/")
+        # The files that were fetched. It is removed with this object, or when the program ends.
+        self._temporary = tempfile.TemporaryDirectory(prefix="irl-")
+        self._layout = Layout(Path(self._temporary.name), read_only=True)
+        self._fetch(["STORE"])
+        with self._errors():
+            layouts.check(self._layout)
+
+    # Reading: as a Store
+
+    def exists(self) -> bool:
+        """Whether there is a store at the URL."""
+        return self._layout.marker.exists()
+
+    def in_use(self) -> AbstractContextManager[None]:
+        """Nothing: no ``gc`` runs there."""
+        return nullcontext()
+
+    def ids(self) -> list[str]:
+        """The ids of all artefacts, sorted, with those that are not whole yet."""
+        return [name for name in self._list("") if is_id(name)]
+
+    def index(self, name_newer: bool = True) -> Index:
+        """All whole artefacts; those with unreadable manifests are skipped with a warning."""
+        self._fetch(f"{id16}/{MANIFEST}" for id16 in self.ids())
+        self._index = sound_manifests(self._layout, lambda text: self.warn(self._shown(text)))
+        return self._index
+
+    def manifests(self, id16: str) -> Index:
+        """The index, read once: again only for an artefact that is newer than that."""
+        if self._index is None or id16 not in self._index.artefacts:
+            return self.index()
+        return self._index
+
+    def peek(self, key: str) -> Peek:
+        """The artefact that holds ``key``, or why it cannot be used.
+
+        Raises:
+            NewerFormat: the artefact has a newer schema.
+        """
+        if self._keys is None:
+            self._keys = {name for name in self._list(".keys") if is_key(name)}
+        if key not in self._keys:
+            return Peek()
+        self._fetch([f".keys/{key}"])
+        id16 = pointed_to(self._layout.keys / key)
+        if id16 is None or not self._has_manifest(id16):
+            return Peek()
+        self._fetch([f"{id16}/{PROVENANCE}"])
+        try:
+            with self._errors():
+                artefact = read_artefact(self._layout.root / id16)
+        except NewerFormat:
+            raise
+        except IntegrityError as error:
+            return Peek(problem=error.message)
+        return Peek(artefact if artefact.manifest.record.key == key else None)
+
+    def names(self) -> dict[str, str]:
+        """Name to id, sorted by name."""
+        self._fetch(f".names/{name}" for name in self._list(".names") if is_name(name))
+        return references.names(self._layout)
+
+    def resolve(self, ref: str) -> references.Resolved:
+        """What ``ref`` names: see :func:`irlcli.store.references.resolve`."""
+        head = ref.partition("/")[0]
+        found = [id16 for id16 in self.ids() if is_prefix(head) and id16.startswith(head[:16])]
+        if is_name(head):
+            found += [id16 for id16 in [self.names().get(head)] if id16 is not None]
+        self._fetch(f"{id16}/{MANIFEST}" for id16 in found)
+        with self._errors():
+            return references.resolve(self._layout, ref)
+
+    def file(self, artefact: Artefact, path: str) -> Path:
+        """A copy of an output, unchecked."""
+        output = artefact.output(path)
+        copy = artefact.directory / output.path
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        with open(copy, "wb") as file:
+            file.writelines(self.read(artefact.id, output))
+        return copy
+
+    def contents(self, id16: str) -> tuple[Manifest, dict[str, Any]]:
+        """Manifest and provenance of an artefact whose files are all there: see :class:`Origin`."""
+        self._fetch([f"{id16}/{MANIFEST}", f"{id16}/{PROVENANCE}"])
+        directory = self._layout.root / id16
+        with self._errors():
+            manifest = read_artefact(directory).manifest
+            sizes = self._sizes(id16)
+            for output in manifest.outputs:
+                where = f"{self.root}/{id16}/{output.path}"
+                if output.path not in sizes:
+                    raise IntegrityError(f"{where} is missing")
+                if sizes[output.path] not in (output.size, None):
+                    raise IntegrityError(
+                        f"{where} has {sizes[output.path]} bytes instead of {output.size}"
+                    )
+            return manifest, read_provenance(directory, manifest.id)
+
+    def read(self, id16: str, output: Output) -> Iterator[bytes]:
+        """The bytes of an output as they are: see :class:`Origin`."""
+        # A request of its own for each chunk bounds the memory, whatever the protocol buffers.
+        for start in range(0, output.size, _CHUNK):
+            with self._errors():
+                end = min(start + _CHUNK, output.size)
+                data = self._fs.cat_file(self._at(f"{id16}/{output.path}"), start=start, end=end)
+            yield data
+
+    # Writing
+
+    def create(self) -> None:
+        """Write the format marker if it is missing.
+
+        Raises:
+            UsageError: a URL that can only be read.
+            IntegrityError: there are other files at the URL.
+        """
+        if self.root.startswith(("http://", "https://")):
+            raise UsageError(f"{self.root} can only be read", "push to a directory or a bucket")
+        if self.exists():
+            return
+        if self._list(""):
+            raise IntegrityError(
+                f"{self.root} contains files but is not a store",
+                "name a store, or an empty or new place",
+            )
+        self._write("STORE", b'{"format": %d}\n' % FORMAT)
+        self._fetch(["STORE"])
+
+    def holds(self, artefact: Artefact) -> bool:
+        """Whether the artefact is there with all its files. Compares sizes; hashes nothing."""
+        wanted = {output.path: output.size for output in artefact.manifest.outputs}
+        wanted[MANIFEST] = len(artefact.manifest.encode())
+        sizes = self._sizes(artefact.id)
+        return PROVENANCE in sizes and all(sizes.get(p, -1) == size for p, size in wanted.items())
+
+    def receive(self, source: Origin, artefact: Artefact, advance: Advance) -> None:
+        """Write a copy of an artefact of ``source``, its manifest last, and read it back.
+
+        Raises:
+            IntegrityError: it is damaged in ``source``, or on the way; it is not visible then.
+        """
+        manifest, provenance = source.contents(artefact.id)
+        for output in manifest.outputs:
+            with (
+                self._errors(),
+                self._fs.open(self._at(f"{artefact.id}/{output.path}"), "wb") as file,
+            ):
+                for chunk in verified(source, artefact.id, output):
+                    file.write(chunk)
+                    advance(len(chunk))
+        for output in manifest.outputs:
+            for _ in verified(self, artefact.id, output):
+                pass
+        self._write(f"{artefact.id}/{PROVENANCE}", encode_provenance(manifest.id, provenance))
+        self._write(f"{artefact.id}/{MANIFEST}", manifest.encode())
+
+    def claim(self, artefact: Artefact) -> None:
+        """Let the artefact hold its key, unless a whole one does."""
+        key = artefact.manifest.record.key
+        holder = self.peek(key)
+        if holder.artefact is None:
+            self._write(f".keys/{key}", artefact.id.encode() + b"\n")
+
+    def claim_name(self, name: str, artefact: Artefact) -> str | None:
+        """Name an artefact; the id of another artefact that has the name already, which keeps it."""
+        (self._layout.names / name).unlink(missing_ok=True)
+        self._fetch([f".names/{name}"])
+        holder = pointed_to(self._layout.names / name)
+        if holder is None:
+            self._write(f".names/{name}", artefact.id.encode() + b"\n")
+        return None if holder in (None, artefact.id) else holder
+
+    # The file system
+
+    def _at(self, name: str) -> str:
+        return f"{self._path}/{name}" if name else self._path
+
+    def _list(self, directory: str) -> list[str]:
+        """The names of what is in a directory, sorted; none if it does not exist."""
+        with self._errors(), suppress(FileNotFoundError, NotADirectoryError):
+            paths = self._fs.ls(self._at(directory), detail=False)
+            return sorted({path.rstrip("/").rpartition("/")[2] for path in paths})
+        return []
+
+    def _sizes(self, id16: str) -> dict[str, int | None]:
+        """The size of each file of an artefact by its path inside it; None where unknown."""
+        directory = self._at(id16)
+        with self._errors(), suppress(FileNotFoundError):
+            found = self._fs.find(directory, detail=True)
+            return {p[len(directory) + 1 :]: info.get("size") for p, info in found.items()}
+        return {}
+
+    def _has_manifest(self, id16: str) -> bool:
+        self._fetch([f"{id16}/{MANIFEST}"])
+        return (self._layout.root / id16 / MANIFEST).exists()
+
+    def _fetch(self, names: Iterable[str]) -> None:
+        """Fetch small files that were not fetched yet; absent ones are left out."""
+        wanted = [name for name in names if not (self._layout.root / name).exists()]
+        for start in range(0, len(wanted), _BATCH):
+            batch = wanted[start : start + _BATCH]
+            with self._errors():
+                # One byte more than what read_json() takes, so that it notices.
+                paths, end = [self._at(name) for name in batch], MAX_JSON_BYTES + 1
+                found = self._fs.cat_ranges(paths, 0, end, on_error="return")
+            for name, data in zip(batch, found, strict=True):
+                if isinstance(data, FileNotFoundError):
+                    continue
+                if isinstance(data, OSError) and data.errno == errno.EINVAL:
+                    # S3 refuses a range of an empty file.
+                    data = b""
+                with self._errors():
+                    if isinstance(data, BaseException):
+                        raise data
+                copy = self._layout.root / name
+                copy.parent.mkdir(exist_ok=True)
+                copy.write_bytes(data)
+
+    def _write(self, name: str, data: bytes) -> None:
+        with self._errors():
+            self._fs.pipe_file(self._at(name), data)
+
+    def _shown(self, text: str) -> str:
+        """A message about a fetched file as one about the URL."""
+        return text.replace(str(self._layout.root), self.root)
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Turn what fsspec and its protocols raise into errors that name the URL."""
+        try:
+            yield
+        except IrlError as error:
+            error.message = self._shown(error.message)
+            raise
+        except Exception as error:
+            raise _explained(error, self.root) from error
+
+
+def _explained(error: Exception, url: str) -> IrlError:
+    # Protocols raise classes of their own, which must not be imported: known by their names.
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    protocol = url.partition("://")[0]
+    text = (str(error) or type(error).__name__).splitlines()[0]
+    if isinstance(error, ValueError) and text.startswith("Protocol not known"):
+        return UsageError(
+            f"{url}: the protocol {protocol!r} is unknown",
+            "name a directory, or a URL such as s3://BUCKET/PATH",
+        )
+    if isinstance(error, ImportError):
+        extra = "pip install 'irlcli[s3]'" if protocol in ("s3", "s3a") else text
+        return UsageError(f"{url}: the package for {protocol!r} is not installed", extra)
+    if kinds & {"NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError"}:
+        return UsageError(
+            f"{url}: no credentials were found",
+            "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE (docs/sharing.md)",
+        )
+    if "ParamValidationError" in kinds:
+        return UsageError(
+            f"{url} is not a valid URL ({' '.join(str(error).split())})",
+            "write PROTOCOL://BUCKET/PATH",
+        )
+    if isinstance(error, PermissionError):
+        return UsageError(
+            f"{url}: access is denied ({text})", "check the credentials and their rights"
+        )
+    if isinstance(error, FileNotFoundError):
+        return NotFound(
+            f"{url}: not found ({text})", "check the URL; a bucket must exist before a push"
+        )
+    return StageFailed(
+        f"{url}: {type(error).__name__}: {text}",
+        "check the URL and the connection, and run the same command again: what arrived is kept",
+    )

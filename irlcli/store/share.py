@@ -1,0 +1,116 @@
+"""Copying artefacts, with all that they were made from and their names, from one store to another.
+
+Either store is on disk or behind a URL. Ancestors are copied first, so that an interrupted copy
+leaves whole artefacts whose inputs are there too; the next one skips them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from irlcli.errors import IntegrityError
+from irlcli.store.artefact import Artefact
+from irlcli.store.layout import is_id
+from irlcli.store.substitute import Advance, ancestors
+
+if TYPE_CHECKING:
+    from irlcli.store.sources import Place
+
+
+class Shared(NamedTuple):
+    """What a copy did.
+
+    Attributes:
+        copied: artefacts that were copied now, ancestors first.
+        present: artefacts that were there already.
+        names: name to id, of those that point to one of them there.
+        taken: name to the id of another artefact that has it there, and keeps it.
+    """
+
+    copied: list[Artefact]
+    present: list[Artefact]
+    names: dict[str, str]
+    taken: dict[str, str]
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the outputs that were copied."""
+        return sum(map(size, self.copied))
+
+
+def share(
+    source: Place,
+    target: Place,
+    artefacts: Sequence[Artefact],
+    warn: Callable[[str], None],
+    start: Callable[[int, int], Advance],
+) -> Shared:
+    """Copy ``artefacts`` of ``source``, their ancestors and their names to ``target``.
+
+    Args:
+        warn: receives what is missing of the lineage.
+        start: receives the number of artefacts and bytes to copy; returns what counts the bytes.
+
+    Raises:
+        IntegrityError: a file is damaged in ``source``. Its artefact does not appear in
+            ``target``, and neither does any that was made from it.
+        OSError: a disk is full or not writable.
+    """
+    wanted = _with_ancestors(source, artefacts, warn)
+    target.create()
+    with target.in_use():
+        # What is there is looked up once; a store on disk answers at once, a bucket does not.
+        there = set(target.ids())
+        present = [a for a in wanted if a.id in there and target.holds(a)]
+        copied = [a for a in wanted if a not in present]
+        advance = start(len(copied), sum(map(size, copied)))
+        for artefact in wanted:
+            if artefact in copied:
+                target.receive(source, artefact, advance)
+            target.claim(artefact)
+        ids = {artefact.id: artefact for artefact in wanted}
+        names = {name: id16 for name, id16 in source.names().items() if id16 in ids}
+        holders = {name: target.claim_name(name, ids[id16]) for name, id16 in names.items()}
+    taken = {name: holder for name, holder in holders.items() if holder is not None}
+    given = {name: id16 for name, id16 in names.items() if name not in taken}
+    return Shared(copied, present, given, taken)
+
+
+def size(artefact: Artefact) -> int:
+    """Bytes of the outputs."""
+    return sum(output.size for output in artefact.manifest.outputs)
+
+
+def _with_ancestors(
+    source: Place, artefacts: Sequence[Artefact], warn: Callable[[str], None]
+) -> list[Artefact]:
+    """``artefacts``, each after all that it was made from."""
+    found: dict[str, Artefact] = {}
+    for artefact in artefacts:
+        index = source.manifests(artefact.id)
+        for member in (*ancestors(artefact, index), artefact):
+            if member.id in found:
+                continue
+            found[member.id] = member
+            orphaned = [role for role, holders in index.parents(member).items() if not holders]
+            if orphaned:
+                _check_missing(source, member, orphaned, warn)
+    return list(found.values())
+
+
+def _check_missing(
+    source: Place, artefact: Artefact, roles: Sequence[str], warn: Callable[[str], None]
+) -> None:
+    """Warn of inputs that were artefacts once and are gone; refuse what is there but damaged."""
+    places = source.contents(artefact.id)[1].get("inputs")
+    for role in roles:
+        place = places.get(role) if isinstance(places, dict) else None
+        id16, slash, _ = str(place).partition("/")
+        if not (slash and is_id(id16)):
+            # A file that never was in a store.
+            continue
+        if id16 in source.ids():
+            source.contents(id16)
+            raise IntegrityError(f"{source.root}/{id16} is not what {artefact.id} was made from")
+        warn(f"{id16} is missing in {source.root}: {artefact.id} was made from it")
