@@ -63,7 +63,9 @@ def _origin(module: str, directory: Path | None, where: str) -> Path:
     """The file of ``module``."""
     importlib.invalidate_caches()
     top, *inner = module.split(".")
-    hint = f"install it, add its directory to PYTHONPATH, or run the command where {top}.py lies"
+    hint = "install it, or add its directory to PYTHONPATH"
+    if directory is None:
+        hint += "; or name the environment's TOML file, which lies beside it: --env, in Python env="
     try:
         spec = importlib.util.find_spec(top)
         for depth in range(len(inner)):

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
+from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.interventions import Setting, parse_setting
 from irlcli.stages.base import EnvironmentKey, Job, Request, Source, Stage, environment_key
 
 if TYPE_CHECKING:
@@ -53,7 +54,12 @@ def request(
     Raises:
         UsageError: a tabular environment, or sources that do not fit the settings.
     """
-    check_tabular(env, "import", wanted=False)
+    if environment(env).tabular:
+        raise UsageError(
+            f"demonstrations of {env} cannot be imported: rewards are learned from them exactly, in "
+            "the grid that they were recorded in",
+            f"`irl collect-experts --env {env}` records them",
+        )
     if len(sources) not in (1, len(settings)):
         raise UsageError(
             f"{len(sources)} sources for {len(settings)} settings",

@@ -158,9 +158,14 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
         ([tmp_path / "empty", *LANDER[:2], "--setting", "default"], 2, "empty"),
         ([exported, exported, exported, *LANDER], 2, "3 sources for 2 settings"),
         (["minari:me", *LANDER], 2, "'me'"),
+        (["minari:m/e-v0", *LANDER], 2, "'m/e-v0'"),
         (["minari:me/nothing-v0", *LANDER], 3, "nothing-v0"),
         ([exported, "minari:me/nothing-v0", *LANDER], 3, "nothing-v0"),
-        ([exported, "--env", "gridworld", "--intervention", "path-group=1"], 2, "gridworld"),
+        (
+            [exported, "--env", "gridworld", "--intervention", "path-group=1"],
+            2,
+            "gridworld cannot be imported",
+        ),
         ([exported, "--env", "lunar-lander", "--intervention", "wind=1"], 2, "wind"),
         ([exported, "--env", "lunar-lander"], 2, "--intervention"),
     ):

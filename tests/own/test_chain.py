@@ -9,7 +9,10 @@ import sys
 
 import pytest
 
-from irlcli.envs import registration
+import irlcli
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.envs import registration, registry
+from irlcli.errors import NotFound
 from irlcli.store import Store
 
 SMOKE = ("--profile", "smoke", "--quiet")
@@ -53,7 +56,27 @@ def test_the_chain_needs_the_file_only_once(bench):
         away = (*again, "--store", "bench/runs")
         lost = bench.irl(*away)
         assert lost.code == 3 and "no module 'cart'" in lost.err and "PYTHONPATH" in lost.err
+        registry.forget()
+        with pytest.raises(NotFound, match="no module 'cart'"):
+            irlcli.load_reward("irm", store="bench/runs")
         assert status(bench, *away, "--env", "bench/cart.toml") == "HIT"
+        reward = irlcli.load_reward("irm", store="bench/runs", env="bench/cart.toml")
+        assert reward.settings == ("mass=1x", "drag=0.5,mass=2x")
+        # So do recordings that come back into a store of another directory.
+        recorded = read_demonstrations(Store("bench/runs").resolve("demos").artefact.directory)
+        away_from = ("--store", "bench/runs", "--to", "parquet:demos.parquet")
+        assert bench.irl("export", "demos", "demos", *away_from).code == 0
+        file = ("demos.parquet", "--env", "bench/cart.toml")
+        own = ("--intervention", "mass=1x", "--setting", "drag=0.5,mass=2x")
+        copied = made(bench, "import", *file, *own, "--store", "other", "--quiet")
+        found = read_demonstrations(Store("other").get(copied).directory)
+        assert found.env == "cart"
+        for text, group in recorded.trajectories.items():
+            for one, other in zip(group, found.trajectories[text], strict=True):
+                assert (one.observations == other.observations).all()
+                assert (one.actions == other.actions).all()
+        unknown = bench.irl("import", *file, "--intervention", "mass=1x,4x", "--store", "other")
+        assert unknown.code == 2 and "is not one of mass=1x, mass=4x" in unknown.err, unknown.err
     # A copy outside the store does not describe its environment.
     shutil.copy(Store("runs").resolve("irm/reward.pt").path, "copied.pt")
     foreign = ("transfer", "--reward", "copied.pt", "--ood", "mass=4x", *SMOKE)

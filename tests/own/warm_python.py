@@ -10,24 +10,21 @@ import os
 import signal
 import socket
 import sys
+from importlib import import_module
+
+HEAVY = (
+    *("matplotlib.pyplot", "stable_baselines3", "irlcli.cli.main", "irlcli.experiments.runner"),
+    *("irlcli.data.exchange.minari", "irlcli.data.exchange.transitions", "irlcli.data.outputs"),
+    *("irlcli.learners.airl", "irlcli.report.build", "irlcli.rl.loop"),
+)
 
 
 def serve(path):
     """Print a line when ready, and serve until killed."""
     # A forked process must not wait for threads that only its parent has.
     os.environ["OMP_NUM_THREADS"] = "1"
-    import matplotlib.pyplot
-    import stable_baselines3
-
-    import irlcli.cli.main
-    import irlcli.data.exchange.minari
-    import irlcli.data.exchange.transitions
-    import irlcli.data.outputs
-    import irlcli.experiments.runner
-    import irlcli.learners.airl
-    import irlcli.report.build
-    import irlcli.rl.loop  # noqa: F401
-
+    for module in HEAVY:
+        import_module(module)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(path)
@@ -48,7 +45,7 @@ def _run(connection):
     words, directory, environment, python = json.loads(message)
     for number, file in enumerate(files):
         os.dup2(file, number)
-    sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
+    sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
     os.chdir(directory)
     os.environ.clear()
     os.environ.update(environment)
