@@ -3,14 +3,16 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from irlcli.lab.facade import Lab
     from irlcli.rewards import LearnedReward, load_reward
     from irlcli.rl.reward_wrappers import RewardVecEnvWrapper, RewardWrapper
 
 __version__ = "0.2.0"
-__all__ = ["LearnedReward", "RewardVecEnvWrapper", "RewardWrapper", "load_reward"]
+__all__ = ["Lab", "LearnedReward", "RewardVecEnvWrapper", "RewardWrapper", "load_reward"]
 
 # Loaded when they are first used: every command imports this package.
 _WHERE = {
+    "Lab": "irlcli.lab.facade",
     "LearnedReward": "irlcli.rewards",
     "load_reward": "irlcli.rewards",
     "RewardWrapper": "irlcli.rl.reward_wrappers",

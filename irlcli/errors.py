@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+RETRY = "No partial output was written. Fix the problem and run the same command again."
+
 
 class IrlError(Exception):
     """An error with a one-line message, a hint and an exit code.
@@ -22,6 +24,9 @@ class IrlError(Exception):
         self.message = message
         self.hint = hint
         self.details: dict[str, object] = {}
+
+    def __str__(self) -> str:
+        return f"{self.message}\nhint: {self.hint}" if self.hint else self.message
 
 
 class StageFailed(IrlError):
@@ -71,6 +76,12 @@ class Interrupted(IrlError):
     """A signal stopped the run after a checkpoint was written (exit 130)."""
 
     exit_code = 130
+
+
+def file_failure(error: OSError) -> StageFailed:
+    """A file that cannot be read or written, as an error with a hint."""
+    where = f": {error.filename}" if error.filename else ""
+    return StageFailed(f"{error.strerror or error}{where}", RETRY)
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:

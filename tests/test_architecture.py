@@ -36,6 +36,8 @@ LAYERS = [
     ["requests"],
     ["rewards"],
     ["cli"],
+    # Another front end, which outside a notebook prints with the command line's console.
+    ["lab"],
 ]
 
 # Package or module -> what it may never import, at any depth of its own code.
@@ -59,6 +61,7 @@ NEVER = {
     "stages": {"stable_baselines3"},
     "experiments": HEAVY | {"numpy"},
     "requests": HEAVY | {"numpy", "typer", "rich"},
+    "lab": (HEAVY - {"pandas"}) | {"numpy", "typer"},
 }
 EXCEPTIONS = {
     # GIFs of a policy at work.
@@ -198,7 +201,7 @@ def test_only_rl_knows_stable_baselines():
         name
         for name in modules()
         if name.split(".")[0]
-        in ("cli", "requests", "stages", "experiments", "store", "configs", "methods")
+        in ("cli", "lab", "requests", "stages", "experiments", "store", "configs", "methods")
         or name in ("errors", "interventions", "envs.registry", "__main__")
         or name in ("learners.__init__", "rl.__init__", "penalties.__init__", "envs.__init__")
         or name.endswith(".spec")

@@ -27,6 +27,26 @@ _CONTROLS = dict.fromkeys([*range(32), *range(127, 160), *range(0x202A, 0x202F)]
 _CONTROLS_BUT_NEWLINE = {code: c for code, c in _CONTROLS.items() if code != ord("\n")}
 
 
+class Pace:
+    """How fast a stage works, in words."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+        self._first_done: int | None = None
+
+    def words(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> str:
+        """Speed, time left, and ``facts``."""
+        now = time.monotonic()
+        if self._first_done is None:
+            # The first steps of a resumed stage were done by an earlier process.
+            self._first_done, self._started = done, now
+        rate = (done - self._first_done) / (now - self._started) if now > self._started else 0.0
+        left = f"{duration((total - done) / rate)} left" if rate > 0 else ""
+        speed = f"{rate:,.0f} {unit}/s" if rate >= 10 else ""
+        parts = [speed, left, *(f"{name} {fact}" for name, fact in facts.items())]
+        return "  ".join(p for p in parts if p)
+
+
 class TerminalConsole:
     """Progress of stages on stderr: a live bar on a terminal, plain lines elsewhere."""
 
@@ -35,8 +55,7 @@ class TerminalConsole:
         self._live: Any = None
         self._task: Any = None
         self._label = ""
-        self._started = self._printed = 0.0
-        self._first_done: int | None = None
+        self._pace, self._printed = Pace(), 0.0
         self._tensorboard = tensorboard
         self._writer: Any = None
         if tensorboard is not None:
@@ -55,22 +74,14 @@ class TerminalConsole:
     def start(self, label: str, resumed: bool) -> None:
         """A stage starts; ``resumed`` from a checkpoint or not."""
         self._label = label
-        self._started, self._first_done = time.monotonic(), None
-        self._printed = self._started - _PLAIN_SECONDS
+        self._pace, self._printed = Pace(), time.monotonic() - _PLAIN_SECONDS
         self._close_live()
         self.say(f"{'RESUME' if resumed else 'RUN'} {label}")
 
     def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
         """Progress of the running stage."""
+        detail = self._pace.words(done, total, unit, facts)
         now = time.monotonic()
-        if self._first_done is None:
-            # The first steps of a resumed stage were done by an earlier process.
-            self._first_done, self._started = done, now
-        rate = (done - self._first_done) / (now - self._started) if now > self._started else 0.0
-        left = f"{duration((total - done) / rate)} left" if rate > 0 else ""
-        speed = f"{rate:,.0f} {unit}/s" if rate >= 10 else ""
-        parts = [speed, left, *(f"{name} {fact}" for name, fact in facts.items())]
-        detail = "  ".join(p for p in parts if p)
         if self._rich:
             self._draw(done, total, detail)
         elif now - self._printed >= _PLAIN_SECONDS or done >= total:
@@ -152,6 +163,11 @@ class TerminalConsole:
             _write(f"\x1b[1;33m{text}\x1b[0m", sys.stderr)
         else:
             _write(text, sys.stderr)
+
+
+def printable(text: str) -> str:
+    """``text`` as one line that controls nothing."""
+    return text.translate(_CONTROLS)
 
 
 def prepare_streams() -> None:

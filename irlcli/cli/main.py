@@ -7,9 +7,7 @@ import sys
 from typing import Any
 
 from irlcli.cli import console
-from irlcli.errors import Interrupted, IrlError, StageFailed, UsageError
-
-_RETRY = "No partial output was written. Fix the problem and run the same command again."
+from irlcli.errors import RETRY, Interrupted, IrlError, StageFailed, UsageError, file_failure
 
 
 def main() -> None:
@@ -49,14 +47,13 @@ def _main() -> None:
     except IrlError as error:
         _fail(error)
     except MemoryError:
-        _fail(StageFailed("out of memory", _RETRY))
+        _fail(StageFailed("out of memory", RETRY))
     except BrokenPipeError:
         console.hang_up()
     except OSError as error:
         if _debugging():
             raise
-        where = f": {error.filename}" if error.filename else ""
-        _fail(StageFailed(f"{error.strerror or error}{where}", _RETRY))
+        _fail(file_failure(error))
     except Exception as error:
         if hasattr(error, "format_message"):
             _fail(_usage(error))

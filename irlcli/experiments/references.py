@@ -60,7 +60,7 @@ def tensor_file(
     if artefact.manifest.record.stage == "clone" and kind == "reward":
         raise UsageError(
             f"{ref!r} is a behavioural clone, which learned no reward",
-            f"irl evaluate --policy {ref} measures its policy",
+            f"`irl evaluate --policy {ref}` measures its policy",
         )
     output = resolved.output or _only(artefact, f"{kind}.pt")
     if output != f"{kind}.pt":

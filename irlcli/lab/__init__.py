@@ -1,0 +1,1 @@
+"""The notebook facade: :class:`irlcli.Lab` runs the stages that the command line runs."""

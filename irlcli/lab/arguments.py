@@ -1,0 +1,111 @@
+"""Python values as the texts of options, and errors about options as errors about arguments."""
+
+from __future__ import annotations
+
+import functools
+import json
+import operator
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from irlcli.errors import IrlError, UsageError, file_failure
+
+Overrides = Mapping[str, Any] | Sequence[str]
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
+    """``method`` with errors that name arguments instead of options, and show no inner frames."""
+
+    @functools.wraps(method)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        try:
+            return method(*args, **kwargs)
+        except IrlError as error:
+            error.message, error.hint = _in_python(error.message), _in_python(error.hint)
+            raise error.with_traceback(None) from None
+        except OSError as error:
+            raise file_failure(error) from None
+
+    return call
+
+
+def _in_python(text: str) -> str:
+    """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
+
+    def argument(match: re.Match[str]) -> str:
+        name = match[1]
+        return match[0] if name is None else _argument(name)
+
+    return re.sub(r"`[^`]*`|--([a-z][a-z-]*)", argument, text)
+
+
+def _argument(option: str) -> str:
+    name = option.replace("-", "_")
+    return "from_" if name == "from" else name
+
+
+def words(command: str, options: Mapping[str, Any], *arguments: str) -> list[str]:
+    """The command line that makes the same as a call with ``options``."""
+    words = ["irl", command, *arguments]
+    for name, value in options.items():
+        option = "--" + name.replace("_", "-")
+        if isinstance(value, bool):
+            # The only option that has both.
+            no = ["--no-state-only"] if name == "state_only" else []
+            words += [option] if value else no
+        elif isinstance(value, list):
+            words += [word for item in value for word in (option, item)]
+        elif value is not None:
+            words += [option, str(value)]
+    return words
+
+
+def overrides(given: Overrides) -> list[str]:
+    """As for ``--set``: each ``FIELD=VALUE``."""
+    if isinstance(given, Mapping):
+        return [f"{field}={_toml(value)}" for field, value in given.items()]
+    return listed(given)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_quoted, value))}]"
+    return "none" if value is None else str(value)
+
+
+def _quoted(value: Any) -> str:
+    return json.dumps(value)
+
+
+def listed(given: Any) -> list[Any]:
+    return [given] if isinstance(given, str | Path) else list(given)
+
+
+def joined(given: Any) -> str | None:
+    """One value, or several, as the options with commas take them."""
+    if given is None or isinstance(given, str):
+        return given
+    return ",".join(map(str, given)) if isinstance(given, Sequence) else str(given)
+
+
+def number(given: float | None) -> float | None:
+    return None if given is None else float(given)
+
+
+def whole(name: str, given: int, least: int = 0) -> int:
+    try:
+        number = operator.index(given)
+    except TypeError:
+        raise UsageError(
+            f"{name} {given!r} is not a whole number", f"write {name}={least}"
+        ) from None
+    if number < least:
+        raise UsageError(f"{name} {number} is less than {least}", f"write {name}={least} or more")
+    return number

@@ -1,0 +1,424 @@
+"""The stages of the command line as methods, for a notebook or a script."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+from irlcli.lab.arguments import Overrides, joined, listed, number, overrides, plainly, whole, words
+from irlcli.lab.display import console
+from irlcli.lab.stored import Evaluations, PlannedTable, Stored
+from irlcli.requests import collect, train
+from irlcli.requests import evaluate as evaluation
+from irlcli.requests import tables as planning
+from irlcli.requests import transfer as retraining
+from irlcli.requests.session import StageSession
+from irlcli.stages.base import Request
+
+Ref = Stored | str | Path
+
+
+class Configs(TypedDict, total=False):
+    """What a single call has different from its lab.
+
+    Attributes:
+        profile, settings: instead of the lab's.
+        set: after the lab's.
+    """
+
+    profile: str
+    settings: str | Path | None
+    set: Overrides
+
+
+class Lab:
+    """A store, and how to fill it: each method runs the stage of the command of the same name.
+
+    Arguments are the command's options, and the artefacts are the same: what a command made is a
+    hit here, and the reverse. A stage shows its progress, in a notebook below the cell. Interrupted
+    (Ctrl-C, or Interrupt in a notebook), it saves a checkpoint and raises
+    :class:`irlcli.errors.Interrupted`; the same call resumes.
+
+    Args:
+        store: directory of the store; the first artefact creates it.
+        profile: ``smoke``, ``standard`` or ``paper``.
+        settings: TOML file that overrides the profile.
+        set: other hyperparameters: ``{"airl.penalty_weight": 30}``, or ``["airl.penalty_weight=30"]``.
+        from_: other stores, directories or URLs, to copy missing artefacts from.
+        workers: processes that step environments.
+        wait: wait while another process makes the same artefact, instead of raising
+            :class:`irlcli.errors.Busy`.
+        quiet: show warnings only.
+
+    Raises:
+        UsageError: an unknown profile. Every method raises :class:`irlcli.errors.IrlError`: its
+            subclasses stand for the command line's exit codes.
+    """
+
+    @plainly
+    def __init__(
+        self,
+        store: str | Path = "runs",
+        *,
+        profile: str = "standard",
+        settings: str | Path | None = None,
+        set: Overrides = (),
+        from_: str | Path | Sequence[str | Path] = (),
+        workers: int = 1,
+        wait: bool = True,
+        quiet: bool = False,
+    ):
+        self.store = Path(store)
+        self.profile = profile
+        self.settings = settings
+        self.set = overrides(set)
+        self.sources = [str(source) for source in listed(from_)]
+        self.workers = whole("workers", workers, 1)
+        self.wait = wait
+        self._console = console(quiet)
+        self._session({}, [])
+
+    def __repr__(self) -> str:
+        return f"irlcli.Lab({str(self.store)!r}, profile={self.profile!r})"
+
+    @plainly
+    def artefact(self, ref: Ref) -> Stored:
+        """The artefact that ``ref`` names: a path, a name, or an id prefix of 3 or more digits."""
+        with self._at_work({}, []) as session:
+            return Stored(session, session.artefact(self._ref(ref)))
+
+    @plainly
+    def collect_experts(
+        self,
+        env: str | Path,
+        intervention: str | None = None,
+        *,
+        setting: str | Sequence[str] = (),
+        expert: Mapping[str, Ref] | None = None,
+        trust: bool = False,
+        episodes: int | Sequence[int] | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Stored:
+        """Train an expert per setting and record its demonstrations.
+
+        Args:
+            env: environment, or a TOML file that describes one.
+            intervention: ``engine-power=1x,1.25x``, or a knob for its ID values in the settings file.
+            setting: settings of several knobs, each ``mass=2x,friction=0.5``.
+            expert: experts of settings, instead of training them: policies, or ``.zip`` files of
+                stable-baselines3, which need ``trust``: loading runs the code in them.
+            episodes: of every setting, or of each.
+            seed: of the recorded episodes.
+            name: to give the artefact.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        options: dict[str, Any] = {
+            "env": str(env),
+            "intervention": intervention,
+            "setting": listed(setting),
+            "expert": [f"{where}={self._ref(who)}" for where, who in (expert or {}).items()],
+            "trust": trust,
+            "episodes": joined(episodes),
+            "seed": whole("seed", seed),
+        }
+        with self._at_work(configs, words("collect-experts", options)) as session:
+            stored = self._run(session, collect.collect_experts(session, **options), name)
+            for warning in collect.missed_bars(session, stored._artefact):
+                session.console.warn(warning)
+            return stored
+
+    @plainly
+    def import_demonstrations(
+        self,
+        recordings: str | Path | Sequence[str | Path],
+        env: str | Path,
+        intervention: str | None = None,
+        *,
+        setting: str | Sequence[str] = (),
+        setting_column: str = "setting",
+        cut: bool = False,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Stored:
+        """Demonstrations that were recorded elsewhere, as an artefact (``irl import``).
+
+        Args:
+            recordings: ``FILE.parquet``, ``minari:DATASET``, or a directory of imitation's
+                trajectories; one for all settings, or one per setting.
+            env, intervention, setting: in which they were recorded.
+            setting_column: column, or key of an episode's metadata, that names its setting.
+            cut: cut long episodes, accept those without an end, leave out empty ones.
+            name: to give the artefact.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        sources = [str(source) for source in listed(recordings)]
+        options: dict[str, Any] = {
+            "env": str(env),
+            "intervention": intervention,
+            "setting": listed(setting),
+            "setting_column": setting_column,
+            "cut": cut,
+        }
+        with self._at_work(configs, words("import", options, *sources)) as session:
+            request = collect.import_demonstrations(session, recordings=sources, **options)
+            return self._run(session, request, name)
+
+    @plainly
+    def train_airl(
+        self,
+        demos: Ref,
+        method: str | None = None,
+        *,
+        grouping: str | None = None,
+        penalty: str | None = None,
+        penalty_weight: float | None = None,
+        choose_penalty: Sequence[float] | str | None = None,
+        select: str | None = None,
+        state_only: bool | None = None,
+        env: str | Path | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Stored:
+        """Learn a reward and a student policy from demonstrations.
+
+        Args:
+            demos: demonstrations.
+            method: ``erm``, ``irm``, ...: a grouping and a penalty, which can also be given.
+            penalty_weight: lambda.
+            choose_penalty: candidates for lambda, compared in a setting left out of training, or
+                ``own`` for the penalty's.
+            select: round to keep: ``last``, or the best on ``episodes`` or in a setting.
+            state_only: reward g(s) instead of g(s, a).
+            env: TOML file of the environment, for demonstrations outside the store.
+            seed: of everything random.
+            name: to give the artefact.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        options: dict[str, Any] = {
+            "demos": self._ref(demos),
+            "method": method,
+            "grouping": grouping,
+            "penalty": penalty,
+            "penalty_weight": number(penalty_weight),
+            "choose_penalty": joined(choose_penalty),
+            "select": select,
+            "state_only": state_only,
+            "env": None if env is None else str(env),
+            "seed": whole("seed", seed),
+        }
+        with self._at_work(configs, words("train-airl", options)) as session:
+            request = train.train_airl(session, **options)
+            assert request is not None  # A lab has no dry run.
+            return self._run(session, request, name)
+
+    @plainly
+    def train_maxent(
+        self,
+        demos: Ref,
+        method: str | None = None,
+        *,
+        grouping: str | None = None,
+        penalty: str | None = None,
+        penalty_weight: float | None = None,
+        l2: float | None = None,
+        features: str | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Stored:
+        """Learn a reward from demonstrations in a gridworld, exactly.
+
+        Args:
+            demos, method, grouping, penalty, penalty_weight, seed, name, configs: as for
+                :meth:`train_airl`.
+            l2: weight decay.
+            features: ``learned`` or ``linear``.
+        """
+        options: dict[str, Any] = {
+            "demos": self._ref(demos),
+            "method": method,
+            "grouping": grouping,
+            "penalty": penalty,
+            "penalty_weight": number(penalty_weight),
+            "l2": number(l2),
+            "features": features,
+            "seed": whole("seed", seed),
+        }
+        with self._at_work(configs, words("train-maxent", options)) as session:
+            return self._run(session, train.train_maxent(session, **options), name)
+
+    @plainly
+    def transfer(
+        self,
+        reward: Ref,
+        ood: str | None = None,
+        *,
+        intervention: str | None = None,
+        setting: str | Sequence[str] = (),
+        algorithm: str | None = None,
+        start: str = "scratch",
+        env: str | Path | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Stored:
+        """Train a new policy on a frozen reward in one setting.
+
+        Args:
+            reward: a learned reward.
+            ood, intervention, setting: the setting; one of them. ``ood="3x"`` is a value of the
+                knob that the reward was learned with.
+            algorithm: retraining algorithm.
+            start: ``scratch``, or ``student``: the policy trained while the reward was learned.
+            env: TOML file of the environment, for a reward outside the store.
+            seed: of everything random.
+            name: to give the artefact.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        options: dict[str, Any] = {
+            "reward": self._ref(reward),
+            "ood": ood,
+            "intervention": intervention,
+            "setting": listed(setting),
+            "algorithm": algorithm,
+            "start": start,
+            "env": None if env is None else str(env),
+            "seed": whole("seed", seed),
+        }
+        with self._at_work(configs, words("transfer", options)) as session:
+            return self._run(session, retraining.transfer(session, **options), name)
+
+    @plainly
+    def evaluate(
+        self,
+        policy: Ref | None = None,
+        ood: str | None = None,
+        *,
+        expert: bool = False,
+        trained_in: str | None = None,
+        random: bool = False,
+        idle: bool = False,
+        reward: Ref | None = None,
+        intervention: str | None = None,
+        setting: str | Sequence[str] = (),
+        env: str | Path | None = None,
+        episodes: int | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Evaluations:
+        """Measure the return of a policy, an expert or a baseline.
+
+        Args:
+            policy: a policy, or an artefact with one. Or one of ``expert=True`` (the expert of each
+                setting), ``random=True`` and ``idle=True``.
+            ood, intervention, setting: settings; by default those the policy was trained in.
+            trained_in: with ``expert``: the experts of these settings, each in all of the others.
+            reward: a learned reward that also scores the episodes.
+            env: the environment of experts and baselines.
+            episodes: per setting.
+            seed: of the episodes.
+            name: to give the artefact.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        options: dict[str, Any] = {
+            "policy": None if policy is None else self._ref(policy),
+            "expert": expert,
+            "trained_in": trained_in,
+            "random": random,
+            "idle": idle,
+            "reward": None if reward is None else self._ref(reward),
+            "ood": ood,
+            "intervention": intervention,
+            "setting": listed(setting),
+            "env": None if env is None else str(env),
+            "episodes": None if episodes is None else whole("episodes", episodes, 1),
+            "seed": whole("seed", seed),
+        }
+        with self._at_work(configs, words("evaluate", options)) as session:
+            requests = evaluation.evaluate(session, **options, name=name)
+            return Evaluations([Stored(session, a) for a in session.run(requests, name)])
+
+    @plainly
+    def plan(
+        self,
+        table: str,
+        *,
+        seeds: int | Sequence[int] | None = None,
+        methods: str | Sequence[str] | None = None,
+        env: str | Path | None = None,
+        choose_penalty: Sequence[float] | str | None = None,
+        until: str | None = None,
+        only: str | None = None,
+        tag: str | None = None,
+        experiments: str | Path | None = None,
+        **configs: Unpack[Configs],
+    ) -> PlannedTable:
+        """Which steps of a table exist or are missing, and why. Nothing is computed or written.
+
+        Args:
+            table: ``table1``, ...
+            seeds, methods, env: only these, of the table's.
+            choose_penalty: candidates for lambda, or ``own``.
+            until: last phase: ``experts``, ``demos``, ``rewards``, ``transfers`` or ``returns``.
+            only: one step and what it needs.
+            tag: what the names of the steps begin with; by default the profile.
+            experiments: TOML file with tables, instead of ``settings/experiments.toml``.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        chosen = planning.Choice(
+            table,
+            joined(seeds),
+            joined(methods),
+            None if env is None else str(env),
+            joined(choose_penalty),
+            until,
+            only,
+            tag,
+            None if experiments is None else Path(experiments),
+        )
+        with self._at_work(configs, [], read_only=True) as session:
+            return PlannedTable(table, planning.steps_of(planning.open_plan(session, chosen)))
+
+    def _session(
+        self, configs: Configs, line: Sequence[str], read_only: bool = False
+    ) -> StageSession:
+        """A session for one call, which artefacts record as the command ``line``."""
+        settings = configs.get("settings", self.settings)
+        session = StageSession(
+            self.store,
+            self._console,
+            profile=configs.get("profile", self.profile),
+            file=None if settings is None else Path(settings),
+            overrides=[*self.set, *overrides(configs.get("set", ()))],
+            sources=self.sources,
+            command=line,
+            wait=self.wait,
+            workers=self.workers,
+            read_only=read_only,
+        )
+        places = ["--store", str(self.store)]
+        places += [word for source in self.sources for word in ("--from", source)]
+        session.command = [*line, *session.config_words(), *places]
+        return session
+
+    @contextmanager
+    def _at_work(
+        self, configs: Configs, line: Sequence[str], read_only: bool = False
+    ) -> Iterator[StageSession]:
+        session = self._session(configs, line, read_only)
+        with session.reading():
+            yield session
+
+    def _run(self, session: StageSession, request: Request, name: str | None) -> Stored:
+        return Stored(session, session.run([request], name)[0])
+
+    def _ref(self, ref: Ref) -> str:
+        if not isinstance(ref, Stored):
+            return str(ref)
+        return ref.id if ref.path.parent == self.store else str(ref.path)

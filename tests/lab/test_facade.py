@@ -1,0 +1,127 @@
+"""irlcli.Lab: the command line's artefacts from Python, its errors, and interruption."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+import irlcli
+from irlcli.cli.console import TerminalConsole
+from irlcli.errors import Interrupted, NotFound, UsageError
+from irlcli.store import Store
+
+IDLE = {"env": "lunar-lander", "intervention": "bounce=0.9", "episodes": 2}
+
+
+@pytest.fixture
+def lab(store_copy):
+    return irlcli.Lab(store_copy.path, profile="smoke", workers=1)
+
+
+def stored(lab):
+    return set(Store(lab.store).index().artefacts)
+
+
+def test_what_the_commands_made_are_hits(lab, store_copy, capsys):
+    before = stored(lab)
+    demos = lab.collect_experts("lunar-lander", "engine-power=1x,1.25x")
+    airl = lab.train_airl(demos, method="irm")
+    moved = lab.transfer(airl, ood="1.5x")
+    score = lab.evaluate(moved, ood="1.5x")
+    assert [demos.id, airl.id] == [store_copy.demos, store_copy.airl]
+    assert [moved.id, score.id] == [store_copy.transfer, store_copy.evaluation]
+    assert stored(lab) == before
+    out, err = capsys.readouterr()
+    assert not out and all(line.startswith("HIT ") for line in err.splitlines())
+    assert sum("train-airl" in line for line in err.splitlines()) == 1
+
+
+def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab):
+    """The command is what `irl show` prints, and what a damaged artefact shows as its repair."""
+    made = [
+        lab.collect_experts("gridworld", "path-group", episodes=[3, 2, 1], seed=2),
+        lab.evaluate(idle=True, **IDLE),
+        lab.train_airl(
+            "demos", "erm", state_only=False, set={"airl.updates_per_round": 1, "airl.bc_epochs": 0}
+        ),
+    ]
+    before = stored(lab)
+    for one in made:
+        record = Store(lab.store).get(one.id).provenance()
+        done = irl(*record["command"][1:])
+        assert (done.code, done.out.strip()) == (0, str(one.path)), done.err
+        assert done.err.startswith("HIT ")
+    assert stored(lab) == before
+
+
+def test_tables_are_data_frames(lab, irl, store_copy):
+    demos, airl, score = (lab.artefact(name) for name in ("demos", "airl", "score"))
+    assert list(demos.to_pandas()["setting"]) == ["engine-power=1x", "engine-power=1.25x"]
+    assert {"round", "setting", "cross_entropy"} <= set(airl.to_pandas())
+    assert score.to_pandas()["setting"].tolist() == ["engine-power=1.5x"]
+    assert len(score.to_pandas("episodes.parquet")) == score.to_pandas()["episodes_per_seed"][0]
+    with pytest.raises(UsageError, match=r"reward\.pt"):
+        airl.to_pandas("reward.pt")
+    experts = lab.evaluate(expert=True, trained_in="engine-power", **{**IDLE, "episodes": 1})
+    assert experts.to_pandas()["agent"].tolist() == [
+        "expert of engine-power=1x",
+        "expert of engine-power=1.25x",
+    ]
+    with pytest.raises(UsageError, match="2 evaluations"):
+        _ = experts.id
+
+
+def test_a_plan_says_what_irl_plan_says(lab, irl):
+    choice = {"seeds": [0], "methods": ["irm"], "env": "lunar-lander"}
+    before = stored(lab)
+    steps = lab.plan("table1", **choice).to_pandas().set_index("name")["status"]
+    line = ["--seeds", "0", "--methods", "irm", "--env", "lunar-lander", "--profile", "smoke"]
+    shown = irl("plan", "table1", *line, "--store", lab.store).out
+    assert [line.split()[0] for line in shown.splitlines()] == steps.tolist()
+    assert stored(lab) == before
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "text"),
+    [
+        (lambda lab: lab.transfer("airl", "1.5x", setting="bounce=0.1"), UsageError, "give one of"),
+        (lambda lab: lab.train_airl("demos", "imr"), UsageError, "hint: did you mean 'irm'"),
+        (lambda lab: lab.train_airl("nothing"), NotFound, "nothing"),
+        (lambda lab: lab.evaluate(idle=True, **{**IDLE, "seed": -1}), UsageError, "seed=0 or more"),
+        (lambda lab: lab.evaluate("airl", seed="0"), UsageError, "seed '0' is not a whole number"),
+        (lambda lab: lab.evaluate("airl", profile="large"), UsageError, "smoke"),
+        (lambda lab: irlcli.Lab("/dev/null/runs").evaluate(idle=True, **IDLE), UsageError, "hint"),
+    ],
+)
+def test_a_mistake_raises_the_error_with_its_hint(lab, capsys, call, error, text):
+    with pytest.raises(error) as caught:
+        call(lab)
+    assert text in str(caught.value)
+    assert "--" not in str(caught.value), "options are named as arguments"
+    assert capsys.readouterr() == ("", "")
+
+
+def test_an_interrupted_call_resumes(lab, capsys, monkeypatch):
+    train = {"demos": "demos", "method": "irm", "seed": 1}
+    shown = TerminalConsole.progress
+
+    def interrupt(console, *progress):
+        shown(console, *progress)
+        signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TerminalConsole, "progress", interrupt)
+        with pytest.raises(Interrupted):
+            lab.train_airl(**train)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    capsys.readouterr()
+    assert lab.train_airl(**train).stage == "train-airl"
+    assert capsys.readouterr().err.startswith("RESUME train-airl")
+
+
+def test_the_package_is_light_to_import():
+    heavy = "{'torch', 'numpy', 'pandas', 'msgspec', 'typer', 'rich', 'IPython'}"
+    code = f"import sys, irlcli; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
