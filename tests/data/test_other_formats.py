@@ -192,16 +192,15 @@ def save_minari(directory, episodes, metadata=(), data_format="hdf5", observatio
     storage.update_episode_metadata(metadata, range(len(metadata)))
 
 
-@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
-def test_a_dataset_of_minari(tmp_path, data_format):
+@pytest.mark.parametrize(("data_format", "size"), [("hdf5", 1), ("hdf5", 1000), ("arrow", 6)])
+def test_a_dataset_of_minari(tmp_path, data_format, size):
     rng = np.random.default_rng(0)
     made = [episode(rng, n) for n in (5, 3, 2)]
     made[1]["terminal"] = False
     names = [{"place": text} for text in ("0.1", "bounce=0.5", "bounce=0.1")]
     save_minari(tmp_path / "data", made, names, data_format)
-    found = imported(
-        read_minari, tmp_path / "data", tmp_path / "out", settings=SETTINGS, column="place"
-    )
+    data, out = tmp_path / "data", tmp_path / "out"
+    found = imported(read_minari, data, out, settings=SETTINGS, column="place", size=size)
     assert list(found) == ["bounce=0.1", "bounce=0.5"]
     group = [found["bounce=0.1"][0], found["bounce=0.5"][0], found["bounce=0.1"][1]]
     for number, (a, b) in enumerate(zip(made, group, strict=True)):
@@ -228,6 +227,22 @@ def test_what_minari_holds_and_irl_cannot_use_is_named(tmp_path):
     save_minari(tmp_path / "b", [], observations=nested)
     with pytest.raises(UsageError, match="observation space is a Dict"):
         imported(read_minari, tmp_path / "b", tmp_path / "out")
+
+
+def test_an_episode_of_another_form_is_named(tmp_path):
+    import h5py
+
+    save_minari(tmp_path / "a", [episode(np.random.default_rng(0), 3) for _ in range(4)])
+    with h5py.File(tmp_path / "a" / "main_data.hdf5", "a") as file:
+        del file["episode_2"]["observations"]
+        file["episode_2"]["observations"] = np.zeros((4, 5), np.float32)
+    with pytest.raises(UsageError, match="episode 2, step 0: obs has 5 numbers"):
+        imported(read_minari, tmp_path / "a", tmp_path / "out")
+    with h5py.File(tmp_path / "a" / "main_data.hdf5", "a") as file:
+        del file["episode_2"]["observations"]
+        file["episode_2"]["observations"] = [b"text"] * 4
+    with pytest.raises(IntegrityError, match="not rows of numbers"):
+        imported(read_minari, tmp_path / "a", tmp_path / "again")
 
 
 def test_no_environment_is_made_to_find_the_spaces(tmp_path):

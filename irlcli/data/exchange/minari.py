@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 
 from irlcli.data.demonstrations import intervention_numbers
 from irlcli.data.exchange.expected import Expected, action_array, unreadable, vectors
-from irlcli.data.steps import Steps, episodes
+from irlcli.data.steps import PIECE, Steps, episodes
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, StageFailed, UsageError
 from irlcli.interventions import Setting
@@ -21,21 +21,35 @@ _MAX_METADATA_BYTES = 16 << 20
 _ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
-def read_minari(directory: Path, expected: Expected) -> Iterator[Steps]:
-    """The steps of the dataset whose data are in ``directory``, episode by episode.
+class _Episode(NamedTuple):
+    """An episode as it is stored: observations [T + 1, ...], and T of everything else."""
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+    metadata: Mapping[str, Any]
+
+    @property
+    def form(self) -> tuple[Any, ...]:
+        """What episodes have in common that are put together."""
+        return tuple((array.shape[1:], array.dtype) for array in self[:2])
+
+
+def read_minari(directory: Path, expected: Expected, size: int = PIECE) -> Iterator[Steps]:
+    """The steps of the dataset whose data are in ``directory``, about ``size`` at a time.
 
     Raises:
         StageFailed: Minari is not installed.
         IntegrityError: not a dataset of Minari, or damaged.
         UsageError: spaces other than vectors and indices, or an episode that cannot be used.
     """
-    storage = _open(directory)
-    indices = range(storage.total_episodes)
-    episodes = _read_all(directory, storage.get_episodes, indices)
-    about = _read_all(directory, storage.get_episode_metadata, indices)
-    for number, (episode, metadata) in enumerate(zip(episodes, about, strict=True)):
+    waiting: dict[int, _Episode] = {}
+    count = 0
+    for number, episode in enumerate(_episodes(directory, expected.column)):
         place = f"{directory} episode {number}"
-        lengths = [len(episode[name]) for name in _ARRAYS]
+        lengths = [len(array) for array in episode[:-1]]
         if lengths[1] == 0:
             expected.irregular.found_empty(place)
             continue
@@ -45,52 +59,113 @@ def read_minari(directory: Path, expected: Expected) -> Iterator[Steps]:
                 "rewards",
                 "an episode of T actions has T + 1 observations and T rewards",
             )
-        yield _steps(episode, metadata, place, expected)
+        alike = not waiting or next(iter(waiting.values())).form == episode.form
+        if count >= size or not alike:
+            yield _steps(directory, waiting, expected)
+            waiting, count = {}, 0
+        waiting[number] = episode
+        count += lengths[1]
+    if waiting:
+        yield _steps(directory, waiting, expected)
 
 
-def _steps(
-    episode: Mapping[str, Any], metadata: Mapping[str, Any], place: str, expected: Expected
-) -> Steps:
-    setting = 0
-    if expected.column is not None:
-        if expected.column not in metadata:
-            raise UsageError(
-                f"{place} has no {expected.column!r}; it has: {', '.join(sorted(metadata))[:400]}",
-                "--setting-column names the key of the episode's metadata",
-            )
-        setting = expected.index(_text(metadata[expected.column]), place)
-    observations = vectors(np.asarray(episode["observations"]))
-    rewards = np.asarray(episode["rewards"], dtype=np.float64)
-    count = len(rewards)
-    terminated = np.asarray(episode["terminations"]).astype(bool)
-    truncated = np.asarray(episode["truncations"]).astype(bool)
-    seed = metadata.get("seed")
+def _steps(directory: Path, episodes: Mapping[int, _Episode], expected: Expected) -> Steps:
+    """The steps of ``episodes``, which are known by their numbers."""
+    numbers, found = list(episodes), list(episodes.values())
+    lengths = np.array([len(episode.rewards) for episode in found])
+    starts = np.cumsum(lengths) - lengths
+
+    def place(row: int) -> str:
+        k = int(np.searchsorted(starts, row, side="right")) - 1
+        return f"{directory} episode {numbers[k]}, step {row - starts[k]}"
+
+    settings, seeds = [], []
+    for number, episode in episodes.items():
+        settings.append(_setting(episode.metadata, expected, f"{directory} episode {number}"))
+        seed = episode.metadata.get("seed")
+        seeds.append(-1 if seed is None else int(seed))
+    first = np.zeros(int(lengths.sum()), dtype=bool)
+    first[starts] = True
+    actions = action_array(np.concatenate([e.actions for e in found]))
     return Steps(
-        first=np.arange(count) == 0,
-        settings=np.full(count, setting),
-        observations=observations[:-1],
-        actions=expected.shaped(action_array(np.asarray(episode["actions"]))),
-        rewards=rewards,
-        next_observations=observations[1:],
-        terminated=terminated,
-        truncated=truncated,
-        seeds=np.full(count, -1 if seed is None else int(seed)),
-        place=lambda row: f"{place}, step {row}",
+        first=first,
+        settings=np.repeat(settings, lengths),
+        observations=vectors(np.concatenate([e.observations[:-1] for e in found])),
+        actions=expected.shaped(actions),
+        rewards=np.concatenate([e.rewards for e in found]).astype(np.float64, copy=False),
+        next_observations=vectors(np.concatenate([e.observations[1:] for e in found])),
+        terminated=np.concatenate([e.terminations for e in found]).astype(bool),
+        truncated=np.concatenate([e.truncations for e in found]).astype(bool),
+        seeds=np.repeat(seeds, lengths),
+        place=place,
     )
 
 
-def _text(name: Any) -> str:
-    return name.decode() if isinstance(name, bytes) else str(name)
+def _setting(metadata: Mapping[str, Any], expected: Expected, place: str) -> int:
+    """The index of an episode's setting."""
+    if expected.column is None:
+        return 0
+    if expected.column not in metadata:
+        raise UsageError(
+            f"{place} has no {expected.column!r}; it has: {', '.join(sorted(metadata))[:400]}",
+            "--setting-column names the key of the episode's metadata",
+        )
+    name = metadata[expected.column]
+    return expected.index(name.decode() if isinstance(name, bytes) else name, place)
 
 
-def _read_all(directory: Path, read: Any, indices: range) -> Iterator[Any]:
-    """What ``read`` yields of each episode; a crafted file makes h5py raise almost anything."""
+def _episodes(directory: Path, column: str | None) -> Iterator[_Episode]:
+    """Every episode; a crafted file makes h5py raise almost anything."""
+    storage = _open(directory)
+    from minari.dataset.minari_storage import is_image_space
+
+    # Minari decodes images.
+    plain = storage.FORMAT == "hdf5" and not is_image_space(storage.observation_space)
     try:
-        yield from read(indices)
-    except MemoryError:
+        if plain:
+            yield from _from_hdf5(directory / "main_data.hdf5", storage.total_episodes, column)
+        else:
+            yield from _from_storage(storage)
+    except (MemoryError, GeneratorExit):
         raise
     except Exception as error:
         raise IntegrityError(unreadable(directory, error), "download the dataset again") from None
+
+
+def _from_hdf5(path: Path, episodes: int, column: str | None) -> Iterator[_Episode]:
+    """Episodes through h5py's low-level interface, without what is not needed of them.
+
+    Minari reads every attribute and what ``info`` held. h5py's own objects cost more than the
+    numbers in an episode of some hundred steps.
+    """
+    import h5py
+
+    wanted = ["seed", *([] if column is None else [column])]
+    with h5py.File(path, "r") as file:
+        for number in range(episodes):
+            group = h5py.h5g.open(file.id, f"episode_{number}".encode())
+            arrays: dict[str, Any] = {}
+            for name in _ARRAYS:
+                stored = h5py.h5d.open(group, name.encode())
+                shape, kind = stored.shape, stored.dtype
+                if kind.kind not in "biuf" or not shape:
+                    raise ValueError(f"{name} of episode {number} are not rows of numbers")
+                array = np.empty(shape, kind)
+                stored.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
+                arrays[name] = array
+            attributes = h5py.Group(group).attrs
+            found = {name: attributes[name] for name in wanted if name in attributes}
+            # For the message, all of them.
+            metadata = found if column in (*found, None) else dict(attributes)
+            yield _Episode(**arrays, metadata=metadata)
+
+
+def _from_storage(storage: Any) -> Iterator[_Episode]:
+    indices = range(storage.total_episodes)
+    about = storage.get_episode_metadata(indices)
+    for episode, metadata in zip(storage.get_episodes(indices), about, strict=True):
+        arrays = {name: np.asarray(episode[name]) for name in _ARRAYS}
+        yield _Episode(**arrays, metadata=metadata)
 
 
 def write_minari(
