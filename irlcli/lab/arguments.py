@@ -36,12 +36,12 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def _in_python(text: str) -> str:
     """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
-
-    def argument(match: re.Match[str]) -> str:
-        name = match[1]
-        return match[0] if name is None else _argument(name)
-
-    return re.sub(r"`[^`]*`|--([a-z][a-z-]*)", argument, text)
+    text = text.replace("the same command again", "the same call again")
+    return re.sub(
+        r"`[^`]*`|--([a-z][a-z-]*)",
+        lambda found: _argument(found[1]) if found[1] else found[0],
+        text,
+    )
 
 
 def _argument(option: str) -> str:

@@ -77,7 +77,7 @@ class NotebookConsole(Silent):
         """A stage ended, or its artefact existed (``hit``)."""
         self._end(f"{'HIT' if hit else 'DONE'} {label}: {artefact.directory}")
 
-    def found(self, label: str, artefact: Artefact, where: Path) -> None:
+    def found(self, label: str, artefact: Artefact, where: Path | str) -> None:
         """An artefact was copied from the store ``where``."""
         self._end(f"FOUND {label}: {artefact.directory}, copied from {where}")
 

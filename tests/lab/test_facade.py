@@ -3,12 +3,13 @@
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 import irlcli
-from irlcli.cli.console import TerminalConsole
 from irlcli.errors import Interrupted, NotFound, UsageError
+from irlcli.lab.display import NotebookConsole
 from irlcli.store import Store
 
 IDLE = {"env": "lunar-lander", "intervention": "bounce=0.9", "episodes": 2}
@@ -42,10 +43,12 @@ def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab):
     made = [
         lab.collect_experts("gridworld", "path-group", episodes=[3, 2, 1], seed=2),
         lab.evaluate(idle=True, **IDLE),
-        lab.train_airl(
-            "demos", "erm", state_only=False, set={"airl.updates_per_round": 1, "airl.bc_epochs": 0}
+        irlcli.Lab(lab.store, profile="smoke", set=["transfer.total_steps=1024"]).transfer(
+            "airl", "1.5x", seed=1, set={"transfer.ppo.n_epochs": 1}
         ),
     ]
+    config = made[-1].parameters["transfer"]
+    assert (config["total_steps"], config["ppo"]["n_epochs"]) == (1024, 1)
     before = stored(lab)
     for one in made:
         record = Store(lab.store).get(one.id).provenance()
@@ -74,12 +77,13 @@ def test_tables_are_data_frames(lab, irl, store_copy):
 
 def test_a_plan_says_what_irl_plan_says(lab, irl):
     choice = {"seeds": [0], "methods": ["irm"], "env": "lunar-lander"}
-    before = stored(lab)
+    new = lab.store.parent / "new"
+    assert set(irlcli.Lab(new).plan("table1", **choice).counts) == {"RUN", "BLOCKED"}
+    assert not new.exists()
     steps = lab.plan("table1", **choice).to_pandas().set_index("name")["status"]
     line = ["--seeds", "0", "--methods", "irm", "--env", "lunar-lander", "--profile", "smoke"]
     shown = irl("plan", "table1", *line, "--store", lab.store).out
     assert [line.split()[0] for line in shown.splitlines()] == steps.tolist()
-    assert stored(lab) == before
 
 
 @pytest.mark.parametrize(
@@ -102,22 +106,40 @@ def test_a_mistake_raises_the_error_with_its_hint(lab, capsys, call, error, text
     assert capsys.readouterr() == ("", "")
 
 
-def test_an_interrupted_call_resumes(lab, capsys, monkeypatch):
-    train = {"demos": "demos", "method": "irm", "seed": 1}
-    shown = TerminalConsole.progress
+@pytest.fixture
+def cell(monkeypatch):
+    """What a cell shows, each display by its updates; the process counts as a notebook's kernel."""
+    displays = []
+
+    def display(line, display_id):
+        displays.append([line])
+        return SimpleNamespace(update=displays[-1].append)
+
+    kernel = SimpleNamespace(kernel=object())
+    monkeypatch.setattr("IPython.get_ipython", lambda: kernel)
+    monkeypatch.setattr("IPython.display.display", display)
+    return displays
+
+
+def test_an_interrupted_cell_resumes(cell, store_copy, monkeypatch):
+    lab = irlcli.Lab(store_copy.path, profile="smoke")
+    train = {"reward": "airl", "ood": "1.5x", "seed": 1}
+    shown = NotebookConsole.progress
 
     def interrupt(console, *progress):
         shown(console, *progress)
         signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(TerminalConsole, "progress", interrupt)
-        with pytest.raises(Interrupted):
-            lab.train_airl(**train)
+        patch.setattr(NotebookConsole, "progress", interrupt)
+        with pytest.raises(Interrupted, match="the same call again"):
+            lab.transfer(**train)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    capsys.readouterr()
-    assert lab.train_airl(**train).stage == "train-airl"
-    assert capsys.readouterr().err.startswith("RESUME train-airl")
+    lab.transfer(**train)
+    stopped, resumed = cell
+    assert [repr(line).split()[0] for line in stopped] == ["RUN", "50%", "STOPPED"]
+    assert (repr(resumed[0]).split()[0], repr(resumed[-1]).split()[0]) == ("RESUME", "DONE")
+    assert "<progress" in stopped[1]._repr_html_() and stopped[2]._repr_html_() is None
 
 
 def test_the_package_is_light_to_import():
