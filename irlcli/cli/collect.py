@@ -30,13 +30,13 @@ def collect_experts(
         typer.Option(
             metavar="SETTING=EXPERT",
             help="Expert of a setting, instead of training one: policy.pt or its artefact, or a .zip "
-            "of stable-baselines3. Repeatable.",
+            "of stable-baselines3, or MODEL.zip+STATISTICS.pkl of one under VecNormalize. Repeatable.",
         ),
     ] = [],  # noqa: B006
     trust: Annotated[
         bool,
         typer.Option(
-            "--trust", help="Load the .zip files of --expert: this runs the code in them."
+            "--trust", help="Load the .zip and .pkl files of --expert: this runs the code in them."
         ),
     ] = False,
     episodes: Annotated[

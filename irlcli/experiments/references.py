@@ -96,6 +96,17 @@ def expert(store: Store, env: str, ref: str) -> Source:
     return source
 
 
+def normaliser(name: str) -> Source:
+    """The statistics of an expert that was trained under VecNormalize. They are not loaded.
+
+    Raises:
+        NotFound: no such file.
+    """
+    if not Path(name).is_file():
+        raise NotFound(f"there is no file {name}", "name a file that VecNormalize.save wrote")
+    return source_of(Resolved(None, Path(name)))
+
+
 def student_beside(store: Store, reward: Source, origin: descriptions.Reward) -> Source:
     """The ``policy.pt`` of the student that was trained while ``reward`` was learned.
 

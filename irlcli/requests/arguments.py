@@ -108,24 +108,30 @@ def _listed(config: "Config", knob: str, kind: Literal["id", "ood"]) -> str:
     return f"; the {kind.upper()} values in settings are {', '.join(values)}" if values else ""
 
 
-def experts(store: "Store", env: str, texts: Sequence[str]) -> dict[Setting, "Source"]:
-    """``--expert SETTING=EXPERT``, repeated.
+def experts(
+    store: "Store", env: str, texts: Sequence[str]
+) -> tuple[dict[Setting, "Source"], dict[Setting, "Source"]]:
+    """``--expert SETTING=EXPERT``, repeated: experts, and statistics of ``EXPERT.zip+STATISTICS``.
 
     Raises:
         UsageError: malformed, a setting with two experts, or a policy of another environment.
         NotFound: no such file or artefact.
     """
-    from irlcli.experiments.references import expert
+    from irlcli.experiments.references import expert, normaliser
 
     found: dict[Setting, Source] = {}
+    normalisers: dict[Setting, Source] = {}
     for text in texts:
         setting, ref = _expert(env, text)
         if setting in found:
             raise UsageError(
                 f"--expert names two experts of {setting}", "name one for each setting"
             )
+        model, plus, statistics = ref.partition(".zip+")
+        if plus:
+            ref, normalisers[setting] = f"{model}.zip", normaliser(statistics)
         found[setting] = expert(store, env, ref)
-    return found
+    return found, normalisers
 
 
 def _expert(env: str, text: str) -> tuple[Setting, str]:

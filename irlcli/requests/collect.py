@@ -45,8 +45,8 @@ def collect_experts(
         counts = arguments.counts(episodes)
     elif listed is not None and not setting:
         counts = listed.episodes
-    experts = arguments.experts(session.store, env, expert)
-    return collect_stage.request(env, settings, config, seed, counts, experts, trust)
+    experts, normalisers = arguments.experts(session.store, env, expert)
+    return collect_stage.request(env, settings, config, seed, counts, experts, trust, normalisers)
 
 
 def missed_bars(session: StageSession, artefact: Artefact) -> Iterator[str]:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from irlcli.rl.policy import Policy
 
 _SAVED = ".zip"
+# The role of an input, before the setting.
+_NORMALISER = "normaliser"
 # Every episode is validated on its own when demonstrations are read.
 _MOST_EPISODES = 100_000
 
@@ -60,11 +62,13 @@ def request(
     episodes: Sequence[int] | None = None,
     experts: Mapping[Setting, Source] | None = None,
     trust: bool = False,
+    normalisers: Mapping[Setting, Source] | None = None,
 ) -> Request:
     """Demonstrations in ``settings``; ``episodes`` is one count for all or one for each.
 
     ``experts`` replace those that would be trained: a ``policy.pt``, or a ``.zip`` that
-    stable-baselines3 saved. Loading the latter runs the code that it holds, so ``trust`` is needed.
+    stable-baselines3 saved, and for one that was trained under its VecNormalize the statistics in
+    ``normalisers``. Loading either file runs the code that it holds, so ``trust`` is needed.
 
     Outputs ``steps.parquet``, ``episodes.parquet`` and ``summary.json``.
 
@@ -105,6 +109,7 @@ def request(
     for s in settings:
         trained = From(train_expert.demonstrator(env, s, config), "policy.pt")
         acting[f"expert {s}"] = (experts or {}).get(s, trained)
+    acting |= {f"{_NORMALISER} {s}": source for s, source in (normalisers or {}).items()}
     return Request(STAGE, parameters, acting, label)
 
 
@@ -133,7 +138,7 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_json
     from irlcli.data.tensors import load_policy_file
     from irlcli.rl.rollout import roll_out
-    from irlcli.rl.saved import load_saved
+    from irlcli.rl.saved import File, load_saved
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
@@ -143,7 +148,9 @@ def run(job: Job) -> None:
         policy: Policy
         path = job.inputs[f"expert {text}"]
         if path.suffix == _SAVED:
-            policy = load_saved(str(path), path.read_bytes(), p.environment.name, setting)
+            beside = job.inputs.get(f"{_NORMALISER} {text}")
+            saved, *statistics = (File(str(f), f.read_bytes()) for f in (path, beside) if f)
+            policy = load_saved(saved, p.environment.name, setting, *statistics)
         else:
             policy, _ = load_policy_file(path)
         # Of the setting's own, so that they are the same whatever else the dataset holds.

@@ -76,6 +76,42 @@ def test_samples_are_reproducible_and_another_file_is_another_key(bench):
     assert demonstrations(bench.irl, *COLLECT, *given)[0].id != first.id
 
 
+def test_a_model_trained_under_vecnormalize_needs_its_statistics(bench):
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    venv = VecNormalize(DummyVecEnv([cart]), norm_reward=False)
+    options = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 16, "batch_size": 16, "seed": 0}
+    import stable_baselines3
+
+    model = stable_baselines3.PPO("MlpPolicy", venv, **options).learn(16)
+    model.save("expert.zip")
+    venv.save("statistics.pkl")
+    (bench.directory / "other.pkl").write_bytes(pickle.dumps([1]))
+    (bench.directory / "bomb.pkl").write_bytes(pickle.dumps(Bomb()))
+    chosen = (*COLLECT, "--intervention", "mass=1x", "--set", "demonstrations.deterministic=true")
+    for expert, trust, code, named in (
+        ("expert.zip", ["--trust"], 2, "was trained under VecNormalize"),
+        ("expert.zip+nothing.pkl", ["--trust"], 3, "no file nothing.pkl"),
+        ("expert.zip+other.pkl", ["--trust"], 4, "other.pkl holds a list"),
+        ("expert.zip+bomb.pkl", [], 2, "runs the code in it"),
+    ):
+        refused = bench.irl(*chosen, "--expert", f"mass=1x={expert}", *trust)
+        assert refused.code == code and named in refused.err, refused.err
+    assert not (bench.directory / "mark").exists()
+    given = ("--expert", "mass=1x=expert.zip+statistics.pkl", "--trust")
+    artefact, found = demonstrations(bench.irl, *chosen, *given)
+    assert artefact.manifest.record.inputs == {
+        "expert mass=1x": file_digest(bench.directory / "expert.zip"),
+        "normaliser mass=1x": file_digest(bench.directory / "statistics.pkl"),
+    }
+    for trajectory in found["mass=1x"]:
+        seen = trajectory.observations[:-1]
+        expected, _ = model.predict(venv.normalize_obs(seen), deterministic=True)
+        np.testing.assert_allclose(np.clip(trajectory.actions, -1, 1), expected, atol=1e-6)
+        raw, _ = model.predict(seen, deterministic=True)
+        assert abs(raw - expected).max() > 1e-3
+
+
 def test_dqn_acts_greedily(bench):
     import gymnasium
 
