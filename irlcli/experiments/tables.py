@@ -43,7 +43,7 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
         name: as in ``irl run NAME``.
         kind: a ``comparison`` of methods has rows, methods, seeds and measures. A file lists none
             of them for the other kinds: ``experts`` has a row for every intervention in
-            ``settings/``, ``figure2`` is about the gridworld, ``control`` about the exact controls.
+            ``settings/`` or of one chosen environment, ``figure2`` is about the gridworld, ``control`` about the exact controls.
         retrainings: of each reward, for every measure of a retrained policy.
         variants: of the config; the table then compares them instead of methods, and has one
             method. The others are compared with the first, which a file names as ``base``.
@@ -106,7 +106,7 @@ def load_table(name: str, path: Path | None = None) -> Table:
         raise UsageError(f"unknown table {name!r}", suggest(name, tables))
     table = tables[name]
     if table.kind == "experts":
-        return msgspec.structs.replace(table, rows=_every_row())
+        return msgspec.structs.replace(table, rows=_rows_of(*ENVIRONMENTS.values()))
     return table
 
 
@@ -117,6 +117,8 @@ def narrowed(
     env: str | None = None,
 ) -> Table:
     """``table`` with other methods and seeds, and only the rows of one environment.
+
+    The experts' table has rows of every environment that can be named, also of one's own.
 
     Raises:
         UsageError: an unknown or repeated method or seed, an empty list, no row of ``env``, a
@@ -139,18 +141,21 @@ def narrowed(
         _check_list("--seeds", seeds)
         changes["seeds"] = tuple(seeds)
     if env is not None:
-        changes["rows"] = tuple(row for row in table.rows if row.env == env)
+        rows = table.rows
+        if table.kind == "experts" and env not in ENVIRONMENTS:
+            rows = _rows_of(environment(env))
+        changes["rows"] = tuple(row for row in rows if row.env == env)
         if not changes["rows"]:
-            names = {row.env for row in table.rows}
+            names = {row.env for row in rows}
             raise UsageError(f"{table.name} has no row of {env!r}", suggest(env, names))
     return msgspec.structs.replace(table, **changes)
 
 
-def _every_row() -> tuple[Row, ...]:
-    """Every intervention that the files in ``settings/`` list, and that has experts of its own."""
+def _rows_of(*environments: EnvironmentSpec) -> tuple[Row, ...]:
+    """Every intervention that the settings list, and that has experts of its own."""
     return tuple(
         Row(env.name, knob)
-        for env in ENVIRONMENTS.values()
+        for env in environments
         if not env.tabular
         for knob in load_config(env.name).interventions
         if env.knobs[knob].cue is None
