@@ -1,13 +1,16 @@
 """irlcli.Lab: the command line's artefacts from Python, its errors, and interruption."""
 
+import inspect
 import signal
 import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
+import typer
 
 import irlcli
+from irlcli.cli.app import app
 from irlcli.errors import Interrupted, NotFound, UsageError
 from irlcli.lab.display import NotebookConsole
 from irlcli.store import Store
@@ -56,6 +59,28 @@ def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab):
         assert (done.code, done.out.strip()) == (0, str(one.path)), done.err
         assert done.err.startswith("HIT ")
     assert stored(lab) == before
+
+
+COMMANDS = {
+    "collect-experts": irlcli.Lab.collect_experts,
+    "import": irlcli.Lab.import_demonstrations,
+    "train-airl": irlcli.Lab.train_airl,
+    "train-maxent": irlcli.Lab.train_maxent,
+    "transfer": irlcli.Lab.transfer,
+    "evaluate": irlcli.Lab.evaluate,
+    "plan": irlcli.Lab.plan,
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_a_command_is_an_argument(command):
+    group = typer.main.get_command(app)
+    _, found, _ = group.resolve_command(group.make_context("irl", ["ls"]), [command])
+    # Of the lab or of every call, of output on a terminal, and the plan for another engine.
+    general = {"profile", "settings", "overrides", "sources", "wait", "workers", "quiet", "store"}
+    general |= {"tensorboard", "dry_run", "as_json", "debug", "to"}
+    arguments = set(inspect.signature(COMMANDS[command]).parameters) - {"self", "configs"}
+    assert arguments == {option.name for option in found.params} - general
 
 
 def test_tables_are_data_frames(lab, irl, store_copy):
