@@ -138,7 +138,7 @@ def _read(inputs: Mapping[str, Path], p: Parameters, expected: Expected) -> Iter
         yield from read(inputs["source"], expected)
         return
     for index, text in enumerate(p.settings):
-        for steps in read(inputs[f"source {text}"], expected):
+        for steps in read(inputs[f"source {text}"], replace(expected, settings=(text,))):
             yield replace(steps, settings=steps.settings + index)
 
 

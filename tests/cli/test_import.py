@@ -133,6 +133,30 @@ def test_a_file_per_setting(irl, store_copy, exported, tmp_path):
     assert both.output("steps.parquet").sha256 == one.output("steps.parquet").sha256
 
 
+def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, minari, tmp_path):
+    """Whether by itself, or one of several in another order than the settings."""
+    store = ["--store", store_copy.path, "--quiet"]
+    table = pq.read_table(exported)
+    names = np.array(table["setting"].to_pylist())
+    first = int(np.argmax(names == "engine-power=1.25x"))
+    refused = f"row {first} is of engine-power=1.25x, as its 'setting' says, not of engine-power=1x"
+    one = [*LANDER[:3], "engine-power=1x"]
+    assert_answered(irl("import", exported, *one, *store), 2, refused)
+    parts = []
+    for text in ("1.25x", "1x"):
+        parts.append(tmp_path / f"{text}.parquet")
+        pq.write_table(table.filter(pa.array(names == f"engine-power={text}")), parts[-1])
+    assert_answered(irl("import", *parts, *LANDER, *store), 2, "1.25x.parquet row 0 is of")
+    imported(irl, store_copy, *reversed(parts), *LANDER)
+    assert irl("export", "demos", "demos", "--to", "minari:me/all-v0", *store[:2]).code == 0
+    assert_answered(irl("import", "minari:me/all-v0", *one, *store), 2, "is of engine-power=1.25x")
+    # In a foreign source the word may mean anything.
+    other = table.drop_columns(["setting"])
+    foreign = pa.array(["1.25x" if i % 2 else "expert" for i in range(len(other))])
+    pq.write_table(other.append_column("setting", foreign), tmp_path / "foreign.parquet")
+    imported(irl, store_copy, tmp_path / "foreign.parquet", *one)
+
+
 def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
     store = store_copy.path
     table = pq.read_table(exported)

@@ -17,6 +17,8 @@ from irlcli.interventions import parse_setting
 from irlcli.trajectories import ActionSpace
 
 Place = Callable[[int], str]
+# What exports call the setting.
+SETTING = "setting"
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Expected:
         env: name of the environment.
         settings: the settings as text.
         column: column, or key of an episode's metadata, that names its setting; None where all
-            episodes are of the one setting.
+            episodes of the source are of the one setting.
         horizon: time limit of the environment [steps].
         actions: the environment's actions.
         irregular: what to do with episodes that are not whole.
@@ -62,6 +64,25 @@ class Expected:
             f"{place}: setting {text[:80]!r} is not one of {', '.join(self.settings)}",
             "name every setting of the source by --intervention or --setting",
         )
+
+    def contradicts(self, name: Any, place: str) -> None:
+        """Refuse a source of the one setting that names another one in ``setting`` all the same.
+
+        Only the whole text of a setting counts: ``setting`` may mean anything in a foreign source.
+
+        Raises:
+            UsageError: ``name`` is another setting of the environment.
+        """
+        (only,) = self.settings
+        try:
+            found = str(parse_setting(self.env, str(name)))
+        except UsageError:
+            return
+        if found != only:
+            raise UsageError(
+                f"{place} is of {found}, as its {SETTING!r} says, not of {only}",
+                "name the settings that the source holds, or rename that column",
+            )
 
     def shaped(self, actions: np.ndarray) -> np.ndarray:
         """``actions`` [B] or [B, A] in the form that the environment's actions have."""

@@ -11,7 +11,13 @@ import gymnasium
 import numpy as np
 
 from irlcli.data.demonstrations import intervention_numbers
-from irlcli.data.exchange.expected import Expected, action_array, unreadable, vectors
+from irlcli.data.exchange.expected import (
+    SETTING,
+    Expected,
+    action_array,
+    unreadable,
+    vectors,
+)
 from irlcli.data.steps import PIECE, Steps, episodes
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, StageFailed, UsageError
@@ -104,14 +110,18 @@ def _steps(directory: Path, episodes: Mapping[int, _Episode], expected: Expected
 def _setting(metadata: Mapping[str, Any], expected: Expected, place: str) -> int:
     """The index of an episode's setting."""
     if expected.column is None:
+        expected.contradicts(_text(metadata.get(SETTING, "")), place)
         return 0
     if expected.column not in metadata:
         raise UsageError(
             f"{place} has no {expected.column!r}; it has: {', '.join(sorted(metadata))[:400]}",
             "--setting-column names the key of the episode's metadata",
         )
-    name = metadata[expected.column]
-    return expected.index(name.decode() if isinstance(name, bytes) else name, place)
+    return expected.index(_text(metadata[expected.column]), place)
+
+
+def _text(name: Any) -> str:
+    return name.decode() if isinstance(name, bytes) else str(name)
 
 
 def _episodes(directory: Path, column: str | None) -> Iterator[_Episode]:
@@ -140,7 +150,7 @@ def _from_hdf5(path: Path, episodes: int, column: str | None) -> Iterator[_Episo
     """
     import h5py
 
-    wanted = ["seed", *([] if column is None else [column])]
+    wanted = ["seed", column or SETTING]
     with h5py.File(path, "r") as file:
         for number in range(episodes):
             group = h5py.h5g.open(file.id, f"episode_{number}".encode())

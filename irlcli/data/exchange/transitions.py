@@ -13,6 +13,7 @@ import pyarrow.compute as pc
 
 from irlcli.data.demonstrations import action_type
 from irlcli.data.exchange.expected import (
+    SETTING,
     Expected,
     Place,
     action_array,
@@ -64,7 +65,8 @@ def _columns(path: Path, found: Sequence[str], expected: Expected) -> list[str]:
             if missing[0] in setting
             else "docs/data.md describes the columns",
         )
-    return [*_REQUIRED, *setting, *(name for name in _OPTIONAL if name in found)]
+    optional = _OPTIONAL if setting else (*_OPTIONAL, SETTING)
+    return [*_REQUIRED, *setting, *(name for name in optional if name in found)]
 
 
 def _steps(
@@ -112,6 +114,8 @@ def _steps(
 
 def _settings(batch: pa.RecordBatch, expected: Expected, place: Place) -> np.ndarray:
     if expected.column is None:
+        if SETTING in batch.schema.names:
+            _check_settings(batch.column(SETTING), expected, place)
         return np.zeros(batch.num_rows, dtype=np.int64)
     column = batch.column(expected.column)
     require_all(column, expected.column, place)
@@ -122,6 +126,14 @@ def _settings(batch: pa.RecordBatch, expected: Expected, place: Place) -> np.nda
         name = coded.dictionary[code].as_py()
         found[code] = expected.index(name, place(int(np.argmax(codes == code))))
     return found[codes]
+
+
+def _check_settings(column: pa.Array, expected: Expected, place: Place) -> None:
+    kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        for name in pc.unique(column).to_pylist():
+            row = pc.index(column.cast(kind), name).as_py() if name is not None else 0
+            expected.contradicts(name, place(row))
 
 
 class _EpisodeStarts:
