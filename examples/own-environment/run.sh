@@ -32,5 +32,14 @@ cmp "$out/demos.parquet" "$out/back.parquet"
 steps=10000; [ "$profile" = smoke ] && steps=200
 $python sac.py irm "$steps"
 
+# A colleague gets the policy and all that it was made from, and measures the same returns. Here the
+# place is a directory; it may be a URL such as s3://BUCKET/PATH.
+$irl push moved --to "$out/shared"
+$irl pull moved --from "$out/shared" --store "$out/colleague"
+$irl verify --store "$out/colleague"
+own=$($irl evaluate --policy moved --profile "$profile")
+theirs=$($irl evaluate --policy moved --profile "$profile" --store "$out/colleague")
+test "$(basename "$own")" = "$(basename "$theirs")"
+
 # Or all at once, with a report: two methods, two seeds. What exists is used.
 $irl run cart --experiments tables.toml --profile "$profile" --jobs 2 --out "$out/report" "${@:3}"

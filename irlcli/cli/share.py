@@ -127,6 +127,11 @@ def _share(
         console.warn(
             f"the name {name!r} was not copied: in {target.root} it names {holder}, and keeps it"
         )
+    for id16, holder in shared.diverged.items():
+        console.warn(
+            f"{id16} is kept beside {holder}: the same request gave {holder} in {target.root}, and "
+            "commands find that one"
+        )
     where = f"{target.root}/"
     console.say(
         f"{_artefacts(len(shared.copied))}, {shared.bytes:,} bytes copied to {target.root}; "
@@ -140,6 +145,7 @@ def _share(
             "bytes": shared.bytes,
             "names": shared.names,
             "names_kept": shared.taken,
+            "diverged": shared.diverged,
         }
         out.print_json("shared", document)
         return

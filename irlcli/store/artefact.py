@@ -1,12 +1,13 @@
 """A published artefact: its directory, its manifest, and checks that change nothing."""
 
 import stat
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError, NotFound, suggest
 from irlcli.store.digest import file_digest
-from irlcli.store.layout import ID_DIGITS
+from irlcli.store.layout import ID_DIGITS, is_id
 from irlcli.store.manifest import (
     MANIFEST,
     PROVENANCE,
@@ -91,6 +92,15 @@ def output_problem(directory: Path, output: Output, quick: bool = False) -> str 
 def entries(directory: Path) -> list[Path]:
     """All paths below ``directory`` except plain directories."""
     return [p for p in directory.rglob("*") if p.is_symlink() or not p.is_dir()]
+
+
+def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[str]:
+    """The ids that the inputs ``roles`` were read from; files outside the store are left out."""
+    places = provenance.get("inputs")
+    if not isinstance(places, dict):
+        return []
+    texts = [str(places.get(role, "")).partition("/") for role in roles]
+    return [id16 for id16, slash, _ in texts if slash and is_id(id16)]
 
 
 def recorded_command(directory: Path) -> str:

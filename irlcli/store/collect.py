@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import Busy, IntegrityError
-from irlcli.store.artefact import Artefact, recorded_command
+from irlcli.store.artefact import Artefact, recorded_command, stored_inputs
 from irlcli.store.claim import live_reader
 from irlcli.store.durable import remove, remove_leftovers
 from irlcli.store.index import Index
 from irlcli.store.integrity import quarantined
-from irlcli.store.layout import Layout, claims, is_id, make_directories
+from irlcli.store.layout import Layout, claims, make_directories
 from irlcli.store.lock import claim_of, exclusive, is_locked
 from irlcli.store.read import index as read_index
 from irlcli.store.references import names
@@ -139,15 +139,11 @@ def _remove_lock(path: Path) -> None:
 
 
 def _stored_inputs(artefact: Artefact, roles: Iterable[str]) -> list[str]:
-    """The ids that the inputs ``roles`` were read from; files outside the store are left out."""
+    """As :func:`irlcli.store.artefact.stored_inputs`; none if the provenance cannot be read."""
     try:
-        places = artefact.provenance().get("inputs") if roles else None
+        return stored_inputs(artefact.provenance(), roles) if roles else []
     except IntegrityError:
         return []
-    if not isinstance(places, dict):
-        return []
-    texts = [str(places.get(role, "")).partition("/") for role in roles]
-    return [id16 for id16, slash, _ in texts if slash and is_id(id16)]
 
 
 def _older(path: Path, limit: float) -> bool:

@@ -16,10 +16,10 @@ from typing import Any
 
 import fsspec
 
-from irlcli.errors import IntegrityError, IrlError, NewerFormat, NotFound, StageFailed, UsageError
+from irlcli.errors import IntegrityError, IrlError, NewerFormat, UsageError
 from irlcli.store import layout as layouts
 from irlcli.store import references
-from irlcli.store.artefact import Artefact, read_artefact
+from irlcli.store.artefact import Artefact, read_artefact, stored_inputs
 from irlcli.store.index import Index
 from irlcli.store.layout import FORMAT, Layout, is_id, is_key, is_name, is_prefix, pointed_to
 from irlcli.store.manifest import (
@@ -32,10 +32,11 @@ from irlcli.store.manifest import (
     read_provenance,
 )
 from irlcli.store.read import Peek
+from irlcli.store.remote_errors import explained
 from irlcli.store.substitute import Advance, Origin, sound_manifests, verified
 
 _CHUNK = 8 << 20
-# Small files fetched at a time. Each is at most MAX_JSON_BYTES.
+# Small files fetched at a time: each is at most MAX_JSON_BYTES.
 _BATCH = 32
 
 
@@ -90,10 +91,29 @@ class Remote:
         return self._index
 
     def manifests(self, id16: str) -> Index:
-        """The index, read once: again only for an artefact that is newer than that."""
-        if self._index is None or id16 not in self._index.artefacts:
+        """An artefact and all that its provenance names, so that not every manifest is fetched.
+
+        If that does not lead to every input, all artefacts.
+        """
+        if self._index is not None and id16 in self._index.artefacts:
+            return self._index
+        found: dict[str, Artefact] = {}
+        named = {id16}
+        try:
+            while pending := sorted(named - found.keys()):
+                self._fetch(f"{i}/{name}" for i in pending for name in (MANIFEST, PROVENANCE))
+                for i in pending:
+                    found[i] = artefact = read_artefact(self._layout.root / i)
+                    inputs = artefact.manifest.record.inputs
+                    named.update(stored_inputs(artefact.provenance(), inputs))
+        except IntegrityError:
             return self.index()
-        return self._index
+        index = Index(found, {})
+        for artefact in found.values():
+            lost = [role for role, holders in index.parents(artefact).items() if not holders]
+            if stored_inputs(artefact.provenance(), lost):
+                return self.index()
+        return index
 
     def peek(self, key: str) -> Peek:
         """The artefact that holds ``key``, or why it cannot be used.
@@ -128,8 +148,8 @@ class Remote:
         """What ``ref`` names: see :func:`irlcli.store.references.resolve`."""
         head = ref.partition("/")[0]
         found = [id16 for id16 in self.ids() if is_prefix(head) and id16.startswith(head[:16])]
-        if is_name(head):
-            found += [id16 for id16 in [self.names().get(head)] if id16 is not None]
+        # All names, so that the nearest one can be suggested.
+        found += [id16 for name, id16 in self.names().items() if name == head]
         self._fetch(f"{id16}/{MANIFEST}" for id16 in found)
         with self._errors():
             return references.resolve(self._layout, ref)
@@ -207,7 +227,9 @@ class Remote:
         for output in manifest.outputs:
             with (
                 self._errors(),
-                self._fs.open(self._at(f"{artefact.id}/{output.path}"), "wb") as file,
+                self._fs.open(
+                    self._at(f"{artefact.id}/{output.path}"), "wb", block_size=_CHUNK
+                ) as file,
             ):
                 for chunk in verified(source, artefact.id, output):
                     file.write(chunk)
@@ -218,12 +240,15 @@ class Remote:
         self._write(f"{artefact.id}/{PROVENANCE}", encode_provenance(manifest.id, provenance))
         self._write(f"{artefact.id}/{MANIFEST}", manifest.encode())
 
-    def claim(self, artefact: Artefact) -> None:
-        """Let the artefact hold its key, unless a whole one does."""
+    def claim(self, artefact: Artefact) -> str | None:
+        """Let the artefact hold its key, unless another one does; returns that one's id."""
         key = artefact.manifest.record.key
-        holder = self.peek(key)
-        if holder.artefact is None:
+        self._fetch([f".keys/{key}"])
+        holder = pointed_to(self._layout.keys / key)
+        if holder is None or not self._has_manifest(holder):
             self._write(f".keys/{key}", artefact.id.encode() + b"\n")
+            return None
+        return None if holder == artefact.id else holder
 
     def claim_name(self, name: str, artefact: Artefact) -> str | None:
         """Name an artefact; the id of another artefact that has the name already, which keeps it."""
@@ -297,41 +322,4 @@ class Remote:
             error.message = self._shown(error.message)
             raise
         except Exception as error:
-            raise _explained(error, self.root) from error
-
-
-def _explained(error: Exception, url: str) -> IrlError:
-    # Protocols raise classes of their own, which must not be imported: known by their names.
-    kinds = {kind.__name__ for kind in type(error).__mro__}
-    protocol = url.partition("://")[0]
-    text = (str(error) or type(error).__name__).splitlines()[0]
-    if isinstance(error, ValueError) and text.startswith("Protocol not known"):
-        return UsageError(
-            f"{url}: the protocol {protocol!r} is unknown",
-            "name a directory, or a URL such as s3://BUCKET/PATH",
-        )
-    if isinstance(error, ImportError):
-        extra = "pip install 'irlcli[s3]'" if protocol in ("s3", "s3a") else text
-        return UsageError(f"{url}: the package for {protocol!r} is not installed", extra)
-    if kinds & {"NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError"}:
-        return UsageError(
-            f"{url}: no credentials were found",
-            "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE (docs/sharing.md)",
-        )
-    if "ParamValidationError" in kinds:
-        return UsageError(
-            f"{url} is not a valid URL ({' '.join(str(error).split())})",
-            "write PROTOCOL://BUCKET/PATH",
-        )
-    if isinstance(error, PermissionError):
-        return UsageError(
-            f"{url}: access is denied ({text})", "check the credentials and their rights"
-        )
-    if isinstance(error, FileNotFoundError):
-        return NotFound(
-            f"{url}: not found ({text})", "check the URL; a bucket must exist before a push"
-        )
-    return StageFailed(
-        f"{url}: {type(error).__name__}: {text}",
-        "check the URL and the connection, and run the same command again: what arrived is kept",
-    )
+            raise explained(error, self.root) from error

@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from irlcli.errors import IntegrityError
-from irlcli.store.artefact import Artefact
-from irlcli.store.layout import is_id
+from irlcli.store.artefact import Artefact, stored_inputs
 from irlcli.store.substitute import Advance, ancestors
 
 if TYPE_CHECKING:
@@ -26,12 +25,14 @@ class Shared(NamedTuple):
         present: artefacts that were there already.
         names: name to id, of those that point to one of them there.
         taken: name to the id of another artefact that has it there, and keeps it.
+        diverged: id to that of the different result that holds the same key there, and keeps it.
     """
 
     copied: list[Artefact]
     present: list[Artefact]
     names: dict[str, str]
     taken: dict[str, str]
+    diverged: dict[str, str]
 
     @property
     def bytes(self) -> int:
@@ -60,21 +61,25 @@ def share(
     wanted = _with_ancestors(source, artefacts, warn)
     target.create()
     with target.in_use():
-        # What is there is looked up once; a store on disk answers at once, a bucket does not.
+        # Asked once: in a bucket, each question is a request.
         there = set(target.ids())
         present = [a for a in wanted if a.id in there and target.holds(a)]
         copied = [a for a in wanted if a not in present]
         advance = start(len(copied), sum(map(size, copied)))
+        diverged = {}
         for artefact in wanted:
             if artefact in copied:
                 target.receive(source, artefact, advance)
-            target.claim(artefact)
+            # Also of what was there: a copy may have been killed before this.
+            holder = target.claim(artefact)
+            if holder is not None:
+                diverged[artefact.id] = holder
         ids = {artefact.id: artefact for artefact in wanted}
         names = {name: id16 for name, id16 in source.names().items() if id16 in ids}
         holders = {name: target.claim_name(name, ids[id16]) for name, id16 in names.items()}
-    taken = {name: holder for name, holder in holders.items() if holder is not None}
+    taken = {name: other for name, other in holders.items() if other is not None}
     given = {name: id16 for name, id16 in names.items() if name not in taken}
-    return Shared(copied, present, given, taken)
+    return Shared(copied, present, given, taken, diverged)
 
 
 def size(artefact: Artefact) -> int:
@@ -103,13 +108,7 @@ def _check_missing(
     source: Place, artefact: Artefact, roles: Sequence[str], warn: Callable[[str], None]
 ) -> None:
     """Warn of inputs that were artefacts once and are gone; refuse what is there but damaged."""
-    places = source.contents(artefact.id)[1].get("inputs")
-    for role in roles:
-        place = places.get(role) if isinstance(places, dict) else None
-        id16, slash, _ = str(place).partition("/")
-        if not (slash and is_id(id16)):
-            # A file that never was in a store.
-            continue
+    for id16 in stored_inputs(source.contents(artefact.id)[1], roles):
         if id16 in source.ids():
             source.contents(id16)
             raise IntegrityError(f"{source.root}/{id16} is not what {artefact.id} was made from")

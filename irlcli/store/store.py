@@ -247,11 +247,13 @@ class Store:
         layouts.make_directories(self._writable)
         receive(self._writable, source, artefact.id, advance)
 
-    def claim(self, artefact: Artefact) -> None:
-        """Let the artefact hold its key, unless another one does."""
+    def claim(self, artefact: Artefact) -> str | None:
+        """Let the artefact hold its key, unless another one does; returns that one's id."""
         from irlcli.store.publish import claim
 
-        claim(self._writable, artefact)
+        key = artefact.manifest.record.key
+        holder = read.held_by(self._layout, key) or claim(self._writable, artefact).id
+        return None if holder == artefact.id else holder
 
     def claim_name(self, name: str, artefact: Artefact) -> str | None:
         """Name an artefact unless another one has the name; returns that one's id."""

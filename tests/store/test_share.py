@@ -8,10 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
+import msgspec
 import pytest
 from every_step import counter, in_child, intercept, kill_self
 
 from irlcli.errors import IntegrityError
+from irlcli.experiments.status import Lookup
+from irlcli.stages.base import Request, Stage
 from irlcli.store import Artefact, Store
 from irlcli.store import remote as remotes
 from irlcli.store.remote import Remote
@@ -186,6 +189,37 @@ def test_a_name_never_moves(irl, store, chain, place, publish, tmp_path):
     assert theirs.names() == {"demos": own.id, "irm-0": chain["airl"].id}
     # Nor does that of the place, when the other store is pushed to it.
     assert push(theirs, place, own).taken == {"demos": chain["demos"].id}
+
+
+@pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
+def test_another_result_of_the_same_request_is_kept_beside(
+    irl, store, chain, place, publish, tmp_path
+):
+    theirs = other(tmp_path)
+    own = publish(theirs, {"f": b"own"}, parameters={"of": "expert"}).artefact
+    push(theirs, place, own)
+    pushed = irl("push", "irm-0", "--to", place, "--store", store.root)
+    assert f"{chain['expert'].id} is kept beside {own.id}" in pushed.err
+    pulled = irl("pull", "irm-0", "--from", place, "--store", theirs.root)
+    assert f"{chain['expert'].id} is kept beside {own.id}" in pulled.err
+    assert theirs.find(own.manifest.record.key) == own
+    assert set(theirs.ids()) == {own.id, *store.ids()}
+
+
+def test_a_file_of_what_was_found_behind_a_url(store, publish, url, tmp_path):
+    """What a plan has to read, such as the lambda that was chosen."""
+
+    class Parameters(msgspec.Struct, frozen=True):
+        of: str = "choice"
+
+    made = publish(store, {"choice.json": b"{}"}, parameters={"of": "choice"}).artefact
+    push(store, url, made)
+    request = Request(Stage("train-airl", 1, print), Parameters(), {}, "choice")
+    lookup = Lookup(other(tmp_path), [Remote(url, pytest.fail)])
+    assert lookup(request).status == "FOUND" and lookup(request).artefact.provenance()
+    assert lookup.file(request, "choice.json").read_bytes() == b"{}"
+    assert Lookup(store).file(request, "choice.json") == made.directory / "choice.json"
+    assert Lookup(other(tmp_path)).file(request, "choice.json") is None
 
 
 # What is damaged or missing
