@@ -122,14 +122,24 @@ def create_bucket() -> str:
 
 def report(label: str, command: list[str]) -> None:
     """Run ``command`` and print what it took."""
-    start = time.monotonic()
-    with open(os.devnull, "wb") as null:
-        process = subprocess.Popen(command, stdout=null, stderr=null)
-        _, status, usage = os.wait4(process.pid, 0)
+    start, peak = time.monotonic(), 0.0
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+        # Not of wait4: that begins with the memory of this process.
+        peak = max(peak, peak_of(process.pid))
+        time.sleep(0.005)
+    _, status, usage = ended
     if status:
         raise SystemExit(f"failed: {' '.join(command)}")
     wall, cpu = time.monotonic() - start, usage.ru_utime + usage.ru_stime
-    print(f"{label:34}{wall:8.2f}{cpu:8.2f}{usage.ru_maxrss / 1024:6.0f}", flush=True)
+    print(f"{label:34}{wall:8.2f}{cpu:8.2f}{peak:6.0f}", flush=True)
+
+
+def peak_of(pid: int) -> float:
+    """Peak memory of a running process [MiB]."""
+    with open(f"/proc/{pid}/status") as file:
+        lines = [line.split() for line in file if line.startswith("VmHWM")]
+    return int(lines[0][1]) / 1024 if lines else 0.0
 
 
 if __name__ == "__main__":
