@@ -62,10 +62,10 @@ def zoo(directory: str, bucket: str) -> None:
     for name, place in at.items():
         pulled = ["pull", "--all", "--from", place, "--store", f"{directory}/{name}"]
         pushed = ["push", "--all", "--to", place, "--store", "zoo"]
-        report(f"irl push, {name}", [*IRL, *pushed])
-        report(f"irl push again, {name}", [*IRL, *pushed])
-        report(f"irl pull, {name}", [*IRL, *pulled])
-        report(f"irl pull again, {name}", [*IRL, *pulled])
+        report(f"push, {name}", [*IRL, *pushed])
+        report(f"push again, {name}", [*IRL, *pushed])
+        report(f"pull, {name}", [*IRL, *pulled])
+        report(f"pull again, {name}", [*IRL, *pulled])
 
 
 def listing(directory: str, bucket: str) -> None:
@@ -73,9 +73,9 @@ def listing(directory: str, bucket: str) -> None:
     for count in (100, 1000):
         for name, place in (("directory", f"{directory}/{count}"), ("S3", f"{bucket}/{count}")):
             last = plant(place, count)
-            report(f"irl ls --from, {count:,}, {name}", [*IRL, "ls", "--from", place])
+            report(f"ls, {count:,} artefacts, {name}", [*IRL, "ls", "--from", place])
             pull = ["pull", last, "--from", place, "--store", f"{directory}/of-{name}-{count}"]
-            report(f"irl pull one of {count:,}, {name}", [*IRL, *pull])
+            report(f"pull one of {count:,}, {name}", [*IRL, *pull])
 
 
 def large(directory: str, bucket: str) -> None:
@@ -83,9 +83,9 @@ def large(directory: str, bucket: str) -> None:
     only = plant(f"{directory}/large", 1, bytes(BIG))
     for name, place in (("directory", f"{directory}/there"), ("S3", f"{bucket}/there")):
         push = ["push", only, "--to", place, "--store", f"{directory}/large"]
-        report(f"irl push {BIG >> 20} MiB, {name}", [*IRL, *push])
+        report(f"push {BIG >> 20} MiB, {name}", [*IRL, *push])
         pull = ["pull", only, "--from", place, "--store", f"{directory}/large-{name}"]
-        report(f"irl pull {BIG >> 20} MiB, {name}", [*IRL, *pull])
+        report(f"pull {BIG >> 20} MiB, {name}", [*IRL, *pull])
 
 
 def plant(place: str, count: int, data: bytes = b"content") -> str:
