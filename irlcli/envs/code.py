@@ -63,9 +63,11 @@ def _origin(module: str, directory: Path | None, where: str) -> Path:
     """The file of ``module``."""
     importlib.invalidate_caches()
     top, *inner = module.split(".")
-    hint = "install it, or add its directory to PYTHONPATH"
+    hint = "install it, add its directory to PYTHONPATH, or "
     if directory is None:
-        hint += "; or name the environment's TOML file, which lies beside it: --env, in Python env="
+        hint += "name the environment's TOML file, which lies beside it: --env, in Python env="
+    else:
+        hint += f"put {top}.py beside the TOML file"
     try:
         spec = importlib.util.find_spec(top)
         for depth in range(len(inner)):
