@@ -242,9 +242,12 @@ class Store:
 
     def receive(self, source: Origin, artefact: Artefact, advance: Advance) -> None:
         """Copy one artefact: see :func:`irlcli.store.substitute.receive`."""
+        from irlcli.store.durable import remove_leftovers
         from irlcli.store.substitute import receive
 
         layouts.make_directories(self._writable)
+        # Of killed copies: they may be large.
+        remove_leftovers(self._layout.work)
         receive(self._writable, source, artefact.id, advance)
 
     def claim(self, artefact: Artefact) -> str | None:

@@ -178,6 +178,7 @@ def test_directories_and_urls_in_the_environment(monkeypatch):
     assert _places("") == []
 
 
+@pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
 def test_a_name_never_moves(irl, store, chain, place, publish, tmp_path):
     push(store, place, chain["airl"])
     theirs = other(tmp_path)
@@ -426,9 +427,9 @@ def test_a_killed_push_shows_nothing_and_is_repeated(store, chain, url, monkeypa
 
 
 def test_a_killed_pull_publishes_whole_artefacts_and_is_repeated(store, chain, url, tmp_path):
-    """Killed at every 29th call that changes a file; the memory of the child has the place."""
+    """Killed at every 61st call that changes a file; the memory of the child has the place."""
     push(store, url, chain["airl"])
-    for limit in range(0, 999, 29):
+    for limit in range(0, 999, 61):
         theirs = Store(tmp_path / f"runs{limit}", pytest.fail)
 
         def killed(root: Path = theirs.root, limit: int = limit) -> None:
@@ -439,6 +440,7 @@ def test_a_killed_pull_publishes_whole_artefacts_and_is_repeated(store, chain, u
         assert Store(theirs.root).verify(Store(theirs.root).ids()) == {}
         pull(url, theirs, "irm-0")
         assert theirs.ids() == store.ids() and theirs.names() == store.names()
+        assert list((theirs.root / ".work").iterdir()) == []
         assert all(theirs.find(a.manifest.record.key) for a in chain.values())
         if ended:
             break
