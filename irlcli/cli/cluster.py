@@ -124,7 +124,7 @@ def print_status(session: StageSession, found: "Plan", options: ClusterOptions) 
 
     queue = open_queue(session, options)
     there = queued(found, queue, session.store)
-    submissions = records(session.store, queue.name)
+    submissions = records(session.store, queue.place)
     lines: list[dict[str, str | None]] = []
     exist = 0
     for name in found.tasks:

@@ -119,7 +119,7 @@ class Cluster:
         munge += [f"--log-file={self.directory}/munge.log", f"--seed-file={self.directory}/seed"]
         self._run("munged", munge)
         self._wait("munged", (self.directory / "munge.socket").exists)
-        self._run("slurmctld", ["slurmctld", "-D", "-f", str(self._conf)])
+        self.start_controller()
         for name in self._names:
             self.start_node(name)
         # A mount of its own hides the directory from this node.
@@ -130,6 +130,15 @@ class Cluster:
             "the nodes",
             lambda: set(self.say("sinfo", "-h", "-N", "-o", "%N %T").splitlines()) == everyone,
         )
+
+    def start_controller(self) -> None:
+        self._run("slurmctld", ["slurmctld", "-D", "-f", str(self._conf)])
+
+    def stop_controller(self) -> None:
+        """End slurmctld; the jobs go on."""
+        process = self._processes.pop("slurmctld")
+        process.terminate()
+        process.wait()
 
     def start_node(self, name: str) -> None:
         self._run(name, ["slurmd", "-D", "-N", name, "-f", str(self._conf)])

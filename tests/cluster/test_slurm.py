@@ -266,6 +266,16 @@ def test_whoever_waited_may_die(runs, whole):
     assert set(runs.computed().values()) == {1}
 
 
+def test_a_controller_that_is_restarted_is_waited_for(runs, whole, cluster):
+    process = runs.submit(**SLOW)
+    runs.wait_for(10, process)
+    cluster.stop_controller()
+    time.sleep(10)
+    cluster.start_controller()
+    done(process)
+    verified(runs, whole)
+
+
 def test_status_and_cancel(runs, cluster):
     done(runs.submit("--detach", IRL_TEST_ROUND="5"))
     time.sleep(3)

@@ -24,12 +24,20 @@ def table(rows=2, runs=3):
 
 
 def started_after(arrays):
-    """For each step, what must have ended before Slurm starts it."""
-    return {
-        name: {*array.after, *([] if array.matching is None else [arrays[array.matching].names[i]])}
-        for array in arrays
-        for i, name in enumerate(array.names)
-    }
+    """For each step, what must have ended before Slurm starts it.
+
+    A single step is submitted as a plain job, which has no elements that ``aftercorr`` could match.
+    """
+    after = {}
+    for number, array in enumerate(arrays):
+        after |= {name: set(array.after) for name in array.names}
+        if array.matching is not None:
+            matched = arrays[array.matching].names
+            assert array.matching < number, f"{array} is submitted before what it matches"
+            assert 2 <= len(array.names) <= len(matched), f"{array} matches {matched}"
+            for name, need in zip(array.names, matched, strict=False):
+                after[name].add(need)
+    return after
 
 
 def closure(needs):
@@ -80,6 +88,4 @@ def test_each_step_waits_for_exactly_what_it_needs(needs):
     arrays = job_arrays(needs)
     after = started_after(arrays)
     assert sorted(after) == sorted(needs)
-    order = [name for array in arrays for name in array.names]
-    after = {name: after[name] for name in order}
     assert closure(after) == closure(needs)

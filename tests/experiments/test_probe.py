@@ -19,7 +19,7 @@ def probe(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
 
     def run(script):
-        for name in ("sbatch", "squeue", "scancel", "sinfo"):
+        for name in ("sbatch", "squeue", "scancel", "scontrol", "sinfo"):
             (tmp_path / name).write_text("#!/bin/sh\necho short\necho long\n")
         (tmp_path / "srun").write_text(f"#!/bin/sh\n{script}\n")
         for path in tmp_path.glob("s*"):

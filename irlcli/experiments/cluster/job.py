@@ -62,8 +62,10 @@ class StepJob(NamedTuple):
                 self._count_turn()
                 _requeue()
                 sys.exit(Interrupted.exit_code)
-            lines.append(f"error: {self.name} was interrupted {turns + 1} times")
-            lines.append("hint: run the same command again: it resumes, with a new count")
+            if code != Busy.exit_code:
+                # Otherwise the last lines say who else works on it.
+                lines.append(f"error: {self.name} was interrupted {turns + 1} times")
+                lines.append("hint: run the same command again: it resumes, with a new count")
         note.write_text(json.dumps(failure(code, lines)._asdict()))
         raise StepFailed(f"{self.name} ended with exit code {code}")
 

@@ -17,6 +17,9 @@ class Local:
 
     name = "local"
     starts_what_waits = False
+    lag = 1.0
+    # Its jobs' ids are those of this machine's processes.
+    place = f"local on {os.uname().nodename}"
 
     def __init__(self, store: Store, minutes: int, warning: int):
         self._store = store
@@ -39,7 +42,7 @@ class Local:
 
     def states(self) -> dict[str, str]:
         """``RUNNING`` for each job that has not ended, by id, those of earlier commands included."""
-        ids = {s.job for record in records(self._store, self.name) for s in record.jobs}
+        ids = {s.job for record in records(self._store, self.place) for s in record.jobs}
         return {i: "RUNNING" for i in ids if self._runs(i)}
 
     def _runs(self, job: str) -> bool:

@@ -34,13 +34,13 @@ class Record:
 
     Attributes:
         directory: with the logs and what became of the steps.
-        cluster: ``slurm`` or ``local``.
+        place: of the queue that runs the jobs.
         jobs: in the order of their submission.
     """
 
-    def __init__(self, directory: Path, cluster: str, jobs: list[Submitted]):
+    def __init__(self, directory: Path, place: str, jobs: list[Submitted]):
         self.directory = directory
-        self.cluster = cluster
+        self.place = place
         self.jobs = jobs
 
     @property
@@ -57,8 +57,7 @@ class Record:
         """Record jobs that were just submitted."""
         value = {
             "schema": _SCHEMA,
-            "cluster": self.cluster,
-            "host": os.uname().nodename,
+            "place": self.place,
             "jobs": [job._asdict() for job in jobs],
         }
         # A file for each array: a table of 10,000 runs has 50,000 jobs in 54 arrays.
@@ -82,24 +81,24 @@ class Record:
         return None
 
 
-def new_record(store: Store, cluster: str) -> Record:
+def new_record(store: Store, place: str) -> Record:
     """A new directory for a submission."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     directory = store.jobs.absolute() / f"{stamp}-{os.urandom(3).hex()}"
-    record = Record(directory, cluster, [])
+    record = Record(directory, place, [])
     for path in (record.logs, record.notes):
         path.mkdir(parents=True)
     return record
 
 
-def records(store: Store, cluster: str) -> list[Record]:
-    """The submissions to ``cluster``, oldest first. What cannot be read is left out."""
+def records(store: Store, place: str) -> list[Record]:
+    """The submissions to the queue at ``place``, oldest first. What cannot be read is left out."""
     found: dict[Path, Record] = {}
     for path in sorted(store.jobs.absolute().glob("*/jobs-*.json")):
         with suppress(OSError, ValueError, KeyError, TypeError):
             value = json.loads(path.read_bytes())
-            if value["schema"] == _SCHEMA and value["cluster"] == cluster:
-                record = found.setdefault(path.parent, Record(path.parent, cluster, []))
+            if value["schema"] == _SCHEMA and value["place"] == place:
+                record = found.setdefault(path.parent, Record(path.parent, place, []))
                 record.jobs += [Submitted(**job) for job in value["jobs"]]
     return list(found.values())
 

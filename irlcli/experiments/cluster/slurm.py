@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,15 +75,31 @@ class Slurm:
     name = "slurm"
     # Slurm starts what waits for other jobs, whether or not anybody watches.
     starts_what_waits = True
+    # An NFS client may not ask its server for 60 s whether a file exists now.
+    lag = 60.0
 
     def __init__(self, resources: Resources):
-        absent = [c for c in ("sbatch", "squeue", "scancel", "srun") if shutil.which(c) is None]
+        needed = ("sbatch", "squeue", "scancel", "scontrol", "srun")
+        absent = [command for command in needed if shutil.which(command) is None]
         if absent:
             raise UsageError(
                 f"--cluster slurm needs Slurm, but {absent[0]} is not on the PATH",
                 "run it on a login node of the cluster, or use --cluster local",
             )
         self._resources = resources
+
+    @cached_property
+    def place(self) -> str:
+        """The cluster's name: several clusters may use a store, and each numbers its own jobs.
+
+        Raises:
+            StageFailed: Slurm does not answer.
+        """
+        done = _say("scontrol", "show", "config")
+        found = re.search(r"^ClusterName\s*=\s*(\S+)", done.stdout, re.MULTILINE)
+        if not found:
+            raise StageFailed(f"scontrol: {_reason(done.stderr)}", "is the controller up?")
+        return f"slurm cluster {found[1]}"
 
     def submit(
         self, jobs: Sequence[StepJob], logs: Path, after: Sequence[str], matching: str | None

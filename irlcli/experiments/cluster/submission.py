@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from irlcli.errors import StageFailed
 from irlcli.experiments.cluster.arrays import Array, job_arrays
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import (
@@ -23,13 +24,26 @@ from irlcli.stages import choose_penalty
 from irlcli.store import Store
 
 _LONGEST_PAUSE = 20.0
+# A controller that restarts, or is too busy to answer, comes back.
+_SILENCE_SECONDS = 600.0
 
 
 class Queue(Protocol):
-    """A place that runs jobs."""
+    """A place that runs jobs.
+
+    Attributes:
+        name: as ``--cluster`` takes it.
+        place: tells it from other queues whose jobs the same store records.
+        starts_what_waits: whether it starts a job by itself when those before it have ended.
+        lag: how long after the end of a job its files may be invisible here [s].
+    """
 
     name: str
     starts_what_waits: bool
+    lag: float
+
+    @property
+    def place(self) -> str: ...
 
     def submit(
         self, jobs: Sequence[StepJob], logs: Path, after: Sequence[str], matching: str | None
@@ -73,7 +87,7 @@ def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
     states = queue.states()
     by_identity: dict[str, Queued] = {}
     by_name: dict[str, Queued] = {}
-    for record in records(store, queue.name):
+    for record in records(store, queue.place):
         for name, identity, job in record.jobs:
             if job in states:
                 by_identity[identity] = by_name[name] = Queued(job, states[job], record)
@@ -110,6 +124,7 @@ class Submission:
         self._waiting: list[Array] = []
         self._arrays: list[Array] = []
         self._record: Record | None = None
+        self._lost: set[str] = set()
         self._stopped = False
         self._outcome = Outcome([], [], [], {}, [], False)
 
@@ -136,11 +151,11 @@ class Submission:
             if not new:
                 return 0
             self._queue.probe(store.root, waiting, warn)
-            remove_ended(records(store, self._queue.name), self._queue.states())
+            remove_ended(records(store, self._queue.place), self._queue.states())
             needs = {name: [n for n in self._plan.needs[name] if n in missing] for name in new}
             self._arrays = job_arrays(needs)
             self._waiting = list(self._arrays)
-            self._record = new_record(store, self._queue.name)
+            self._record = new_record(store, self._queue.place)
             if self._queue.starts_what_waits:
                 for array in self._arrays:
                     self._submit(array.names, array.after, array.matching)
@@ -148,26 +163,37 @@ class Submission:
         return len(new)
 
     def watch(self) -> Outcome:
-        """Wait until every job has ended, or a signal asks to stop; the jobs of Slurm go on."""
+        """Wait until every job has ended, or a signal asks to stop; the jobs of Slurm go on.
+
+        Raises:
+            StageFailed: the queue did not answer for ten minutes.
+        """
         alive = set(self._ids)
         running: dict[str, float] = {}
-        gone: dict[str, int] = {}
-        started = time.monotonic()
+        gone: dict[str, float] = {}
+        started = answered = time.monotonic()
         with stop_requests(self._stop):
             while (alive or self._waiting) and not self._stopped:
                 if self._waiting:
                     alive |= self._start_ready(len(alive))
-                states = self._queue.states()
+                try:
+                    states = self._queue.states()
+                except StageFailed:
+                    if time.monotonic() - answered > _SILENCE_SECONDS:
+                        raise
+                    self._pause(time.monotonic() - started)
+                    continue
+                answered = time.monotonic()
                 self._plan.lookup.forget_missing()
                 for name in [task for task in self._plan.tasks if task in alive]:
                     state = states.get(self._ids[name])
                     if state is None:
-                        # Once more at the next look: a file system of the network may lag.
-                        gone[name] = gone.get(name, 0) + 1
-                        since = running.get(name, started)
-                        if self._ended(name, last=gone[name] > 2, since=since):
+                        last = answered - gone.setdefault(name, answered) > self._queue.lag
+                        if self._ended(name, last, since=running.get(name, started)):
                             alive.remove(name)
-                    elif state.startswith("RUNNING") and name not in running:
+                        continue
+                    gone.pop(name, None)
+                    if state.startswith("RUNNING") and name not in running:
                         running[name] = time.monotonic()
                         self._display.start(name)
                 if alive:
@@ -251,9 +277,14 @@ class Submission:
                 self._plan.refresh()
             self._display.done(name, time.monotonic() - since)
             return True
+        if not self._lost.isdisjoint(self._plan.needs[name]):
+            # Slurm removed it with the job that it depended on.
+            self._lost.add(name)
+            return True
         failure = self._records[name].failure(name)
         if failure is None and not last:
             return False
+        self._lost.add(name)
         if all(self._exists(need) for need in self._plan.needs[name]):
             if failure is None:
                 log = self._records[name].log(name)
