@@ -17,7 +17,7 @@
 #   JOBS=2                           processes at a time
 #   CLUSTER=slurm PARTITION=P TIME=4:00:00 CPUS=1   jobs of a cluster instead (docs/cluster.md)
 #   STORE=DIR                        artefact store; by default IRL_STORE or runs
-#   FROM=DIR                         store to copy from what it holds, or s3://...; FROM= trains everything
+#   FROM=DIR                         store to copy from what it holds, or a URL; FROM= trains everything
 #   RESULTS=DIR                      where a report's files go; by default results/TAG/TARGET
 #
 # Every target can be interrupted and run again: what exists is kept, what was interrupted resumes.
@@ -32,7 +32,7 @@ RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(addprefix -,$(ENVIRONMENT))
 
 IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
-CHOSEN   = --store $(STORE) --profile $(PROFILE) $(addprefix --from ,$(filter s3://%,$(FROM)) $(wildcard $(FROM))) $(SET) $(CHOOSE) \
+CHOSEN   = --store $(STORE) --profile $(PROFILE) $(foreach place,$(FROM),$(addprefix --from ,$(if $(findstring ://,$(place)),$(place),$(wildcard $(place))))) $(SET) $(CHOOSE) \
     $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --env ,$(ENVIRONMENT))
 OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))

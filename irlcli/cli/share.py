@@ -7,7 +7,7 @@ import typer
 from irlcli.cli import console as out
 from irlcli.cli.options import store_command
 from irlcli.cli.session import Session
-from irlcli.errors import IntegrityError, NotFound, UsageError
+from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
@@ -62,7 +62,6 @@ def pull(
         raise NotFound(
             f"{place.root}: {error.message}", f"`irl ls --from {place.root}` lists what is there"
         ) from None
-    session.store.create()
     _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet)
 
 
@@ -116,10 +115,9 @@ def _share(
     try:
         shared = share(source, target, artefacts, console.warn, start)
     except IntegrityError as error:
-        error.hint = (
-            f"{error.message.partition(' ')[0]} is damaged in {source.root}: remove the artefact "
-            "there, or compute or push it again"
-        )
+        # The place to copy to can be at fault, too.
+        if error.message.startswith(f"{source.root}/") and not isinstance(error, NewerFormat):
+            error.hint = f"remove the artefact in {source.root}, or compute or push it again"
         raise
     finally:
         console.close()

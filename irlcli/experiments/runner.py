@@ -75,7 +75,8 @@ class Runner:
         command: the command line to record, so that a damaged artefact shows how to repair it.
         checkpoint_seconds: least time between two checkpoints [s].
         workers: processes that step the environments; not part of any artefact's identity.
-        sources: stores, on disk or behind URLs, that are only read. What one of them holds is copied from there, not computed.
+        sources: stores, on disk or behind URLs, that are only read. What one of them holds is
+            copied from there, not computed.
     """
 
     def __init__(

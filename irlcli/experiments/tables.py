@@ -43,7 +43,8 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
         name: as in ``irl run NAME``.
         kind: a ``comparison`` of methods has rows, methods, seeds and measures. A file lists none
             of them for the other kinds: ``experts`` has a row for every intervention in
-            ``settings/`` or of one chosen environment, ``figure2`` is about the gridworld, ``control`` about the exact controls.
+            ``settings/`` or of one chosen environment, ``figure2`` is about the gridworld,
+            ``control`` about the exact controls.
         retrainings: of each reward, for every measure of a retrained policy.
         variants: of the config; the table then compares them instead of methods, and has one
             method. The others are compared with the first, which a file names as ``base``.

@@ -36,7 +36,7 @@ _MARKS: dict[str, type[BaseAlgorithm]] = {
     "policy_delay": TD3,
     "exploration_fraction": DQN,
 }
-# Not null in a file whose model was trained under VecNormalize.
+# Not null in a file whose PPO was trained under VecNormalize. The others set it in any case.
 _NORMALISED = "_last_original_obs"
 _MAX_JSON_BYTES = 64 << 20
 _STATISTICS = "name the file that VecNormalize.save wrote for this expert"
@@ -96,8 +96,8 @@ def load_saved(
 
     Raises:
         IntegrityError: not a file that SB3's PPO, SAC, TD3 or DQN wrote, or not readable here.
-        UsageError: the expert has other observations or actions than the setting, or was trained
-            under VecNormalize and there are no statistics.
+        UsageError: the expert has other observations or actions than the setting, or is a PPO that
+            was trained under VecNormalize and there are no statistics.
     """
     name, data = saved
     with closing(make(env, setting)) as world:
@@ -105,7 +105,7 @@ def load_saved(
         spaces = inner.observation_space, inner.action_space
     fields = _fields(name, data)
     kind = _algorithm(name, fields)
-    if fields.get(_NORMALISED) is not None and statistics is None:
+    if kind is PPO and fields.get(_NORMALISED) is not None and statistics is None:
         raise UsageError(
             f"{name} was trained under VecNormalize, whose statistics are not part of the file",
             f"name them, too, as VecNormalize.save wrote them: SETTING={name}+STATISTICS.pkl",

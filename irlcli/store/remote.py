@@ -16,7 +16,7 @@ from typing import Any
 
 import fsspec
 
-from irlcli.errors import IntegrityError, IrlError, NewerFormat, UsageError
+from irlcli.errors import IntegrityError, IrlError, NewerFormat, StageFailed, UsageError
 from irlcli.store import layout as layouts
 from irlcli.store import references
 from irlcli.store.artefact import Artefact, read_artefact, stored_inputs
@@ -59,9 +59,8 @@ class Remote:
         self._index: Index | None = None
         self._keys: set[str] | None = None
         with self._errors():
-            # Another process may write there at the same time: no listing is kept.
-            options = {"use_listings_cache": False, "skip_instance_cache": True}
-            self._fs, path = fsspec.core.url_to_fs(self.root, **options)
+            # No other option: some protocols pass what they do not know on to their servers.
+            self._fs, path = fsspec.core.url_to_fs(self.root, skip_instance_cache=True)
         self._path = path.rstrip("/")
         # The files that were fetched. It is removed with this object, or when the program ends.
         self._temporary = tempfile.TemporaryDirectory(prefix="irl-")
@@ -187,6 +186,11 @@ class Remote:
             with self._errors():
                 end = min(start + _CHUNK, output.size)
                 data = self._fs.cat_file(self._at(f"{id16}/{output.path}"), start=start, end=end)
+            if len(data) > end - start and output.size > _CHUNK:
+                raise StageFailed(
+                    f"{self.root} sends whole files when it is asked for a part",
+                    "use a server that answers HTTP range requests",
+                )
             yield data
 
     # Writing
@@ -225,12 +229,8 @@ class Remote:
         """
         manifest, provenance = source.contents(artefact.id)
         for output in manifest.outputs:
-            with (
-                self._errors(),
-                self._fs.open(
-                    self._at(f"{artefact.id}/{output.path}"), "wb", block_size=_CHUNK
-                ) as file,
-            ):
+            path = self._new(f"{artefact.id}/{output.path}")
+            with self._errors(), self._fs.open(path, "wb", block_size=_CHUNK) as file:
                 for chunk in verified(source, artefact.id, output):
                     file.write(chunk)
                     advance(len(chunk))
@@ -266,14 +266,19 @@ class Remote:
 
     def _list(self, directory: str) -> list[str]:
         """The names of what is in a directory, sorted; none if it does not exist."""
+        own = self._at(directory)
+        # Another process may write there at the same time.
+        self._fs.invalidate_cache()
         with self._errors(), suppress(FileNotFoundError, NotADirectoryError):
-            paths = self._fs.ls(self._at(directory), detail=False)
-            return sorted({path.rstrip("/").rpartition("/")[2] for path in paths})
+            paths = {path.rstrip("/") for path in self._fs.ls(own, detail=False)}
+            # A bucket's directory can hold an empty object of its own name.
+            return sorted(path.rpartition("/")[2] for path in paths - {own})
         return []
 
     def _sizes(self, id16: str) -> dict[str, int | None]:
         """The size of each file of an artefact by its path inside it; None where unknown."""
         directory = self._at(id16)
+        self._fs.invalidate_cache()
         with self._errors(), suppress(FileNotFoundError):
             found = self._fs.find(directory, detail=True)
             return {p[len(directory) + 1 :]: info.get("size") for p, info in found.items()}
@@ -306,8 +311,18 @@ class Remote:
                 copy.write_bytes(data)
 
     def _write(self, name: str, data: bytes) -> None:
+        path = self._new(name)
         with self._errors():
-            self._fs.pipe_file(self._at(name), data)
+            self._fs.pipe_file(path, data)
+
+    def _new(self, name: str) -> str:
+        """The path of a file to be written, after its directories were made."""
+        path = self._at(name)
+        # Object stores have no directories; their paths begin with a bucket, which must exist.
+        if path.startswith("/"):
+            with self._errors():
+                self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
+        return path
 
     def _shown(self, text: str) -> str:
         """A message about a fetched file as one about the URL."""

@@ -63,20 +63,21 @@ def share(
     with target.in_use():
         # Asked once: in a bucket, each question is a request.
         there = set(target.ids())
-        present = [a for a in wanted if a.id in there and target.holds(a)]
-        copied = [a for a in wanted if a not in present]
+        held = {a.id for a in wanted if a.id in there and target.holds(a)}
+        present = [a for a in wanted if a.id in held]
+        copied = [a for a in wanted if a.id not in held]
         advance = start(len(copied), sum(map(size, copied)))
         diverged = {}
         for artefact in wanted:
-            if artefact in copied:
+            if artefact.id not in held:
                 target.receive(source, artefact, advance)
             # Also of what was there: a copy may have been killed before this.
             holder = target.claim(artefact)
             if holder is not None:
                 diverged[artefact.id] = holder
-        ids = {artefact.id: artefact for artefact in wanted}
-        names = {name: id16 for name, id16 in source.names().items() if id16 in ids}
-        holders = {name: target.claim_name(name, ids[id16]) for name, id16 in names.items()}
+        members = {artefact.id: artefact for artefact in wanted}
+        names = {name: id16 for name, id16 in source.names().items() if id16 in members}
+        holders = {name: target.claim_name(name, members[id16]) for name, id16 in names.items()}
     taken = {name: other for name, other in holders.items() if other is not None}
     given = {name: id16 for name, id16 in names.items() if name not in taken}
     return Shared(copied, present, given, taken, diverged)

@@ -112,6 +112,16 @@ def test_a_model_trained_under_vecnormalize_needs_its_statistics(bench):
         assert abs(raw - expected).max() > 1e-3
 
 
+def test_sac_that_learned_without_vecnormalize_needs_no_statistics(bench):
+    import stable_baselines3
+
+    options = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 10, "seed": 0}
+    stable_baselines3.SAC("MlpPolicy", cart(), **options).learn(3).save("expert.zip")
+    given = ("--intervention", "mass=1x", "--expert", "mass=1x=expert.zip", "--trust")
+    _, found = demonstrations(bench.irl, *COLLECT, *given)
+    assert list(found) == ["mass=1x"]
+
+
 def test_dqn_acts_greedily(bench):
     import gymnasium
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import http.server
 import json
 import os
+import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import fsspec
@@ -12,7 +15,7 @@ import msgspec
 import pytest
 from every_step import counter, in_child, intercept, kill_self
 
-from irlcli.errors import IntegrityError
+from irlcli.errors import IntegrityError, StageFailed
 from irlcli.experiments.status import Lookup
 from irlcli.stages.base import Request, Stage
 from irlcli.store import Artefact, Store
@@ -84,11 +87,13 @@ def bucket(s3_server, monkeypatch, tmp_path) -> str:
     return f"s3://{name}"
 
 
-@pytest.fixture(params=["directory", "memory", "s3"])
+@pytest.fixture(params=["directory", "folders", "memory", "s3"])
 def place(request, tmp_path) -> str:
-    """A place to push to."""
+    """A place to push to; ``folders`` have to be made before a file is written, as by sftp."""
     if request.param == "directory":
         return str(tmp_path / "there")
+    if request.param == "folders":
+        return f"local://{tmp_path}/there"
     if request.param == "memory":
         return request.getfixturevalue("url")
     return request.getfixturevalue("bucket") + "/lab"
@@ -374,7 +379,34 @@ def test_files_that_are_no_store_are_left_alone(irl, store, chain, url):
     memory().pipe_file(f"/{url.removeprefix('memory://')}/thesis.tex", b"x")
     result = irl("push", "irm-0", "--to", url, "--store", store.root)
     assert result.code == 4 and "not a store" in result.err
+    assert result.err.endswith("hint: name a store, or an empty or new place\n")
     assert memory().ls(f"/{url.removeprefix('memory://')}", detail=False)[1:] == []
+
+
+def test_an_empty_folder_of_a_bucket_can_be_pushed_to(store, chain, bucket):
+    """Consoles make one as an object whose name ends in a slash."""
+    fsspec.filesystem("s3").call_s3("put_object", Bucket=bucket[5:], Key="lab/", Body=b"")
+    assert len(push(store, f"{bucket}/lab", chain["airl"]).copied) == 3
+
+
+def test_a_web_server_needs_ranges_for_large_files(store, chain, tmp_path, monkeypatch):
+    pytest.importorskip("aiohttp")
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Quiet, directory=str(store.root))
+    )
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = f"http://127.0.0.1:{server.server_port}"
+    assert len(pull(url, other(tmp_path), "demos").copied) == 2
+    monkeypatch.setattr(remotes, "_CHUNK", 3)
+    with pytest.raises(StageFailed, match="range"):
+        pull(url, Store(tmp_path / "third", pytest.fail), "demos")
+    server.shutdown()
+    server.server_close()
 
 
 def test_an_unknown_reference_names_the_place(irl, store, chain, url, tmp_path):
@@ -409,6 +441,7 @@ def test_a_killed_push_shows_nothing_and_is_repeated(store, chain, url, monkeypa
 
     for limit in range(99):
         memory().store.clear()
+        memory().pseudo_dirs[:] = [""]
         stopped = stopped_after(limit)
         if limit > 0:  # the marker itself is half written before
             warnings: list[str] = []
