@@ -44,7 +44,7 @@ def main() -> None:
     )
     try:
         with tempfile.TemporaryDirectory() as directory:
-            bucket = create_bucket()
+            bucket = create_bucket(server)
             print(f"{'':34}{'wall s':>8}{'CPU s':>8}{'MiB':>6}")
             zoo(directory, bucket)
             listing(directory, bucket)
@@ -110,14 +110,15 @@ def bare(verb: str, source: str, target: str) -> list[str]:
     return [sys.executable, "-c", COPY.format(verb=verb), source, target]
 
 
-def create_bucket() -> str:
+def create_bucket(server: subprocess.Popen) -> str:
     """The URL of a new bucket, as soon as the server answers."""
-    while True:
+    while server.poll() is None:
         try:
             fsspec.filesystem("s3").mkdir("bench")
             return "s3://bench"
         except OSError:
             time.sleep(0.5)
+    raise SystemExit(f"the S3 server ended: is moto installed, and port {PORT} free?")
 
 
 def report(label: str, command: list[str]) -> None:

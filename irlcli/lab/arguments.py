@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import json
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypedDict, TypeVar
 
-from irlcli.errors import IrlError, UsageError, file_failure
+from irlcli.errors import IrlError, UsageError, file_failure, suggest
 
 Overrides = Mapping[str, Any] | Sequence[str]
 
@@ -18,11 +19,28 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
+class Configs(TypedDict, total=False):
+    """What a single call has different from its lab.
+
+    Attributes:
+        profile, settings: instead of the lab's.
+        set: after the lab's.
+    """
+
+    profile: str
+    settings: str | Path | None
+    set: Overrides
+
+
 def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
     """``method`` with errors that name arguments instead of options, and show no inner frames."""
+    known = {*inspect.signature(method).parameters, *Configs.__annotations__} - {"self", "configs"}
 
     @functools.wraps(method)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        # ``**configs`` would take any name.
+        for name in kwargs.keys() - known:
+            raise UsageError(f"{method.__name__} has no argument {name!r}", suggest(name, known))
         try:
             return method(*args, **kwargs)
         except IrlError as error:

@@ -5,9 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, Unpack
 
-from irlcli.lab.arguments import Overrides, joined, listed, number, overrides, plainly, whole, words
+from irlcli.lab.arguments import (
+    Configs,
+    Overrides,
+    joined,
+    listed,
+    number,
+    overrides,
+    plainly,
+    whole,
+    words,
+)
 from irlcli.lab.display import console
 from irlcli.lab.stored import Evaluations, PlannedTable, Stored
 from irlcli.requests import collect, train
@@ -18,19 +28,6 @@ from irlcli.requests.session import StageSession
 from irlcli.stages.base import Request
 
 Ref = Stored | str | Path
-
-
-class Configs(TypedDict, total=False):
-    """What a single call has different from its lab.
-
-    Attributes:
-        profile, settings: instead of the lab's.
-        set: after the lab's.
-    """
-
-    profile: str
-    settings: str | Path | None
-    set: Overrides
 
 
 class Lab:

@@ -116,6 +116,7 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
     [
         (lambda lab: lab.transfer("airl", "1.5x", setting="bounce=0.1"), UsageError, "give one of"),
         (lambda lab: lab.train_airl("demos", "imr"), UsageError, "hint: did you mean 'irm'"),
+        (lambda lab: lab.train_airl("demos", metod="irm"), UsageError, "did you mean 'method'"),
         (lambda lab: lab.train_airl("nothing"), NotFound, "nothing"),
         (lambda lab: lab.evaluate(idle=True, **{**IDLE, "seed": -1}), UsageError, "seed=0 or more"),
         (lambda lab: lab.evaluate("airl", seed="0"), UsageError, "seed '0' is not a whole number"),
