@@ -33,7 +33,7 @@ from irlcli.store.manifest import (
 )
 from irlcli.store.read import Peek
 from irlcli.store.remote_errors import explained
-from irlcli.store.substitute import Advance, Origin, sound_manifests, verified
+from irlcli.store.substitute import Advance, Origin, check, sound_manifests, verified
 
 _CHUNK = 8 << 20
 # Small files fetched at a time: each is at most MAX_JSON_BYTES.
@@ -228,15 +228,15 @@ class Remote:
             IntegrityError: it is damaged in ``source``, or on the way; it is not visible then.
         """
         manifest, provenance = source.contents(artefact.id)
+        # First: where a file was lost, the others that lie here may be the only sound ones.
+        check(source, artefact.id, manifest)
         for output in manifest.outputs:
             path = self._new(f"{artefact.id}/{output.path}")
             with self._errors(), self._fs.open(path, "wb", block_size=_CHUNK) as file:
                 for chunk in verified(source, artefact.id, output):
                     file.write(chunk)
                     advance(len(chunk))
-        for output in manifest.outputs:
-            for _ in verified(self, artefact.id, output):
-                pass
+        check(self, artefact.id, manifest)
         self._write(f"{artefact.id}/{PROVENANCE}", encode_provenance(manifest.id, provenance))
         self._write(f"{artefact.id}/{MANIFEST}", manifest.encode())
 

@@ -161,6 +161,17 @@ def verified(source: Origin, id16: str, output: Output) -> Iterator[bytes]:
         raise IntegrityError(f"{source.root}/{id16}/{output.path} differs from the published bytes")
 
 
+def check(source: Origin, id16: str, manifest: Manifest) -> None:
+    """Hash every output of an artefact.
+
+    Raises:
+        IntegrityError: the bytes of one are not the published ones.
+    """
+    for output in manifest.outputs:
+        for _ in verified(source, id16, output):
+            pass
+
+
 def contents(layout: Layout, id16: str) -> tuple[Manifest, dict[str, Any]]:
     """:meth:`Origin.contents` of a store on disk."""
     # Finds damaged JSON, wrong sizes, symbolic links and unlisted files before any copying.

@@ -281,6 +281,17 @@ def test_a_damaged_artefact_here_is_not_pushed(irl, store, chain, url):
     assert list(Remote(url, pytest.fail).index().artefacts) == [chain["expert"].id]
 
 
+def test_a_damaged_artefact_here_replaces_nothing_there(store, chain, url):
+    push(store, url, chain["expert"])
+    memory().rm(at(url, chain["expert"], "nested/g"))
+    path = chain["expert"].directory / "f"
+    path.chmod(0o644)
+    path.write_bytes(b"EXPERT")
+    with pytest.raises(IntegrityError, match="differs"):
+        push(store, url, chain["expert"])
+    assert memory().cat_file(at(url, chain["expert"], "f")) == b"expert"
+
+
 def test_what_changes_on_the_way_is_not_visible(store, chain, url, monkeypatch):
     monkeypatch.setattr(remotes.Remote, "read", lambda *_: iter([b"other"]))
     with pytest.raises(IntegrityError, match="differs"):
