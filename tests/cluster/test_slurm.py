@@ -2,7 +2,8 @@
 
 The jobs, their command lines, signals, claims and artefacts are real. What the stages compute is
 replaced by rounds of a hash chain (``tests/experiments/fake_stages``), so that a table with
-two rows, three methods and three seeds takes a minute on two cores.
+two rows, three methods and three seeds takes a minute on two cores. One test trains, at a smaller
+table.
 """
 
 from __future__ import annotations
@@ -38,6 +39,13 @@ rows = ["lunar-lander.engine-power"]
 methods = ["irm", "vrex"]
 seeds = [1, 2, 3]
 measures = ["zero-shot"]
+
+[small]
+title = "A table that is small enough to be trained"
+rows = ["lunar-lander.engine-power"]
+methods = ["irm"]
+seeds = [0, 1]
+measures = ["zero-shot"]
 """
 UNTIL = ("--until", "returns")
 SLOW = {"IRL_TEST_ROUND": "0.5"}
@@ -63,17 +71,18 @@ def cluster(tmp_path_factory):
 class Runs:
     """``irl`` in processes of its own, on the cluster."""
 
-    def __init__(self, directory: Path, cluster: Cluster):
+    def __init__(self, directory: Path, cluster: Cluster, train: bool = False):
+        directory.mkdir(exist_ok=True)
         self.log = directory / "log"
         self.log.touch()
         self.tables = directory / "tables.toml"
         self.tables.write_text(TABLES)
         self.store = directory / "runs"
-        fakes = str(CHECKOUT / "tests/experiments/fake_stages")
+        fakes = [] if train else [str(CHECKOUT / "tests/experiments/fake_stages")]
         self.environment = {
             **os.environ,
             **cluster.environment,
-            "PYTHONPATH": os.pathsep.join([fakes, str(CHECKOUT)]),
+            "PYTHONPATH": os.pathsep.join([*fakes, str(CHECKOUT)]),
             "IRL_TEST_LOG": str(self.log),
             "IRL_TEST_ROUND": "0.02",
         }
@@ -169,6 +178,24 @@ def test_a_node_killed_in_the_middle_changes_nothing(runs, whole, cluster, jobs_
     cluster.start_node("n1")
     done(process)
     verified(runs, whole)
+
+
+def test_real_training_on_a_node_that_is_killed_ends_in_the_same_ids(tmp_path, cluster):
+    here = Runs(tmp_path / "here", cluster, train=True)
+    there = Runs(tmp_path / "there", cluster, train=True)
+    done(here.table("--jobs", "2", *UNTIL, name="small"))
+    process = there.submit(name="small")
+    on_n1 = ("squeue", "-h", "-r", "--states=RUNNING", "--nodelist=n1", "-o", "%i")
+    # All but the rewards and their returns.
+    there.wait_for(9, process)
+    while not cluster.say(*on_n1).strip():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    cluster.kill_node("n1", jobs_too=True)
+    time.sleep(12)
+    cluster.start_node("n1")
+    done(process)
+    verified(there, Store(here.store).ids())
 
 
 def test_cancelled_at_random_fifty_times_it_ends_in_the_same_ids(runs, whole, cluster):
