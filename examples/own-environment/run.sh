@@ -3,7 +3,7 @@
 #
 #   examples/own-environment/run.sh [DIRECTORY] [PROFILE] [OPTIONS]
 #
-# PROFILE is standard (minutes) or smoke (seconds; nothing is learned). DIRECTORY receives the store,
+# PROFILE is standard (minutes) or smoke (some minutes, most of them to start processes; nothing is learned). DIRECTORY receives the store,
 # a dataset of Minari and the report. OPTIONS are those of irl run, for example --seeds 0.
 set -euo pipefail
 out=$(realpath "${1:-cart-results}")

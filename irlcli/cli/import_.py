@@ -37,9 +37,12 @@ def import_(
     ] = None,
     setting: OneSetting = [],  # noqa: B006
     setting_column: Annotated[
-        str,
-        typer.Option(help="Column, or key of an episode's metadata, that names its setting."),
-    ] = "setting",
+        str | None,
+        typer.Option(
+            help="Column, or key of an episode's metadata, that names its setting. Of several "
+            "settings in one source, by default `setting`."
+        ),
+    ] = None,
     cut: Annotated[
         bool,
         typer.Option(

@@ -117,7 +117,7 @@ def _share(
     except IntegrityError as error:
         # The place to copy to can be at fault, too.
         if error.message.startswith(f"{source.root}/") and not isinstance(error, NewerFormat):
-            error.hint = f"remove the artefact in {source.root}, or compute or push it again"
+            error.hint = f"remove the artefact in {source.root}, then compute or push it again"
         raise
     finally:
         console.close()

@@ -362,9 +362,12 @@ def _field_hint(field: str) -> str:
                     f"{meta.description or 'a number'} from {meta.ge:g} to {meta.le:g}{or_none}"
                 )
                 return bounds if value is None else f"{bounds}, for example {_shown(value)}"
+    if value is msgspec.UNSET:
+        whole = any(int in get_args(member) for member in get_args(kind))
+        return "write a whole number from 0, or omit it" if whole else "write a value, or omit it"
     if value is None:
         return "write a value, or none"
-    return "write a value, or omit it" if value is msgspec.UNSET else f"for example {_shown(value)}"
+    return f"for example {_shown(value)}"
 
 
 def _shown(value: Any) -> str:

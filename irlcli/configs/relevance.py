@@ -205,7 +205,7 @@ def _warmup(maxent: MaxEntConfig) -> int | UnsetType:
         raise UsageError(
             f"maxent.penalty_warmup_iterations = {warmup} leaves none of {maxent.iterations} "
             "iterations with a penalty",
-            "maxent.penalty_warmup_iterations below maxent.iterations",
+            "set maxent.penalty_warmup_iterations below maxent.iterations",
         )
     return warmup
 

@@ -113,8 +113,11 @@ def joined(given: Any) -> str | None:
     return ",".join(map(str, given)) if isinstance(given, Sequence) else str(given)
 
 
-def number(given: float | None) -> float | None:
-    return None if given is None else float(given)
+def number(name: str, given: float | None) -> float | None:
+    try:
+        return None if given is None else float(given)
+    except (TypeError, ValueError):
+        raise UsageError(f"{name} {given!r} is not a number", f"write {name}=1.0") from None
 
 
 def whole(name: str, given: int, least: int = 0) -> int:

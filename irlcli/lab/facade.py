@@ -136,7 +136,7 @@ class Lab:
         intervention: str | None = None,
         *,
         setting: str | Sequence[str] = (),
-        setting_column: str = "setting",
+        setting_column: str | None = None,
         cut: bool = False,
         name: str | None = None,
         **configs: Unpack[Configs],
@@ -147,7 +147,8 @@ class Lab:
             recordings: ``FILE.parquet``, ``minari:DATASET``, or a directory of imitation's
                 trajectories; one for all settings, or one per setting.
             env, intervention, setting: in which they were recorded.
-            setting_column: column, or key of an episode's metadata, that names its setting.
+            setting_column: column, or key of an episode's metadata, that names its setting; by
+                default ``setting`` if there are several.
             cut: cut long episodes, accept those without an end, leave out empty ones.
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
@@ -201,7 +202,7 @@ class Lab:
             "method": method,
             "grouping": grouping,
             "penalty": penalty,
-            "penalty_weight": number(penalty_weight),
+            "penalty_weight": number("penalty_weight", penalty_weight),
             "choose_penalty": joined(choose_penalty),
             "select": select,
             "state_only": state_only,
@@ -241,8 +242,8 @@ class Lab:
             "method": method,
             "grouping": grouping,
             "penalty": penalty,
-            "penalty_weight": number(penalty_weight),
-            "l2": number(l2),
+            "penalty_weight": number("penalty_weight", penalty_weight),
+            "l2": number("l2", l2),
             "features": features,
             "seed": whole("seed", seed),
         }

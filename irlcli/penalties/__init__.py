@@ -139,11 +139,16 @@ def check_penalty(name: str, learner: str) -> None:
 
 
 def check_risks(name: str, grouping: str, settings: int) -> None:
-    """Refuse a penalty that compares risks where there is only one.
+    """Refuse a penalty that compares risks, and shuffled labels, where there is only one.
 
     Raises:
         UsageError: one setting, or a grouping that makes one risk of all.
     """
+    if grouping == "shuffled" and settings < 2:
+        raise UsageError(
+            "one setting has no labels to shuffle",
+            "collect demonstrations of another setting, or use --method irm",
+        )
     if not PENALTIES[name].compares:
         return
     if settings < 2:

@@ -68,7 +68,7 @@ def import_demonstrations(
     env: str,
     intervention: str | None,
     setting: Sequence[str],
-    setting_column: str,
+    setting_column: str | None,
     cut: bool,
 ) -> Request:
     """Demonstrations that were recorded elsewhere.

@@ -41,13 +41,13 @@ def request(
     sources: Sequence[Source],
     env: str,
     settings: Sequence[Setting],
-    setting_column: str = "setting",
+    setting_column: str | None = None,
     cut: bool = False,
 ) -> Request:
     """The demonstrations in ``sources``, all of the same ``form``, made in ``settings`` of ``env``.
 
-    One source of several settings names them in ``setting_column``. Several sources are of one
-    setting each, in the order of ``settings``.
+    One source of several settings names them in ``setting_column``, by default ``setting``. Several
+    sources are of one setting each, in the order of ``settings``.
 
     Outputs ``steps.parquet``, ``episodes.parquet`` and ``summary.json``.
 
@@ -65,17 +65,22 @@ def request(
             f"{len(sources)} sources for {len(settings)} settings",
             "give one source that names the setting of each episode, or one source per setting",
         )
-    several = len(sources) < len(settings)
-    if several and form == "imitation":
+    if len(sources) > 1 and setting_column is not None:
         raise UsageError(
-            f"imitation's trajectories name no setting, but {len(settings)} settings are given",
-            "give one directory per setting",
+            f"--setting-column {setting_column}, but each of {len(sources)} sources is of one setting",
+            "omit --setting-column, or give one source that names the setting of each episode",
+        )
+    if len(sources) < len(settings):
+        setting_column = setting_column or "setting"
+    if setting_column is not None and form == "imitation":
+        raise UsageError(
+            "imitation's trajectories name no setting", "give one directory per setting, and no column"
         )
     parameters = Parameters(
         environment=environment_key(env, settings),
         settings=tuple(str(s) for s in settings),
         form=form,
-        setting_column=setting_column if several else None,
+        setting_column=setting_column,
         cut=cut,
     )
     inputs = {"source": sources[0]}

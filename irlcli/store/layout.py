@@ -83,7 +83,7 @@ def check(layout: Layout) -> None:
         UsageError: the root is not a directory.
     """
     root, marker = layout.root, layout.marker
-    hint = "name a directory with --store"
+    hint = "name a directory: an artefact store, or one that is empty or not there yet"
     try:
         if not stat.S_ISDIR(root.stat().st_mode):
             raise UsageError(f"{root} is not a directory", hint)

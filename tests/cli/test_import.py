@@ -170,11 +170,15 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
     (tmp_path / "empty").mkdir()
     pq.write_table(table.slice(0, 0), tmp_path / "none.parquet")
     other = ["--env", "lunar-lander", "--intervention", "engine-power=1x,1.5x"]
+    lone = ["--env", "lunar-lander", "--intervention", "engine-power=1x"]
     robot = ["--env", "half-cheetah", "--intervention", "friction"]
     before = snapshot(store)
     for words, code, named in (
         ([exported, *other], 2, "setting 'engine-power=1.25x' is not one of"),
         ([exported, *robot, "--setting-column", "nothing"], 2, "no column 'nothing'"),
+        ([exported, *lone, "--setting-column", "nothing"], 2, "no column 'nothing'"),
+        ([exported, *lone, "--setting-column", "setting"], 2, "'engine-power=1.25x' is not one of"),
+        ([exported, exported, *LANDER, "--setting-column", "s"], 2, "is of one setting"),
         ([tmp_path / "nan.parquet", *LANDER], 2, f"row {len(table) - 1}: reward is not finite"),
         ([tmp_path / "text.parquet", *LANDER], 4, "text.parquet"),
         ([tmp_path / "none.parquet", *LANDER], 2, "no episode"),

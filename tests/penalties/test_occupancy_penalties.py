@@ -120,3 +120,9 @@ def test_a_penalty_that_compares_settings_refuses_a_single_risk(name):
         check_risks(name, "balanced", 2)
     check_risks(name, "shuffled", 2)
     check_risks("irmv1", "per-setting", 1)
+
+
+@pytest.mark.parametrize("name", ["irmv1", "vrex"])
+def test_labels_of_one_setting_cannot_be_shuffled(name):
+    with pytest.raises(UsageError, match="no labels to shuffle"):
+        check_risks(name, "shuffled", 1)
