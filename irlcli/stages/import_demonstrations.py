@@ -74,7 +74,8 @@ def request(
         setting_column = setting_column or "setting"
     if setting_column is not None and form == "imitation":
         raise UsageError(
-            "imitation's trajectories name no setting", "give one directory per setting, and no column"
+            "imitation's trajectories name no setting",
+            "give one directory per setting, and no column",
         )
     parameters = Parameters(
         environment=environment_key(env, settings),
