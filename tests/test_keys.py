@@ -610,8 +610,8 @@ def test_what_an_import_is_told_changes_its_key():
         imported(cut=True),
     ]
     assert len({plain, *others}) == 8
-    # Nothing is read from the column of a source of one setting.
-    assert imported(settings=SETTINGS[:1]) == imported(settings=SETTINGS[:1], setting_column="x")
+    # A source of one setting need not name it, but a column that is named is read.
+    assert imported(settings=SETTINGS[:1]) != imported(settings=SETTINGS[:1], setting_column="x")
 
 
 def test_settings_and_their_order_change_the_key():
