@@ -3,13 +3,14 @@
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from irlcli.cli import console as out
-from irlcli.cli.session import StageSession
-from irlcli.errors import UsageError, suggest
+from irlcli.cli.session import Session, StageSession
+from irlcli.errors import StageFailed, UsageError, suggest
 
 if TYPE_CHECKING:
     from irlcli.experiments.cluster.submission import Queue
@@ -46,7 +47,8 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
         UsageError: an unknown name or option, or Slurm or submitit is missing.
     """
     from irlcli.experiments.cluster.local import Local
-    from irlcli.experiments.cluster.slurm import Resources, Slurm, parse_minutes
+    from irlcli.experiments.cluster.resources import Resources, parse_minutes
+    from irlcli.experiments.cluster.slurm import Slurm
 
     if options.cluster not in CLUSTERS:
         raise UsageError(
@@ -60,8 +62,6 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     minutes = parse_minutes(options.time)
     # A job of few minutes is warned when half of them are over.
     warning = min(_WARNING_SECONDS, 30 * minutes)
-    if options.cluster == "local":
-        return Local(session.store, minutes, warning)
     extra = {}
     for item in options.sbatch:
         name, equals, value = item.partition("=")
@@ -70,9 +70,10 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
                 f"--sbatch {item!r} is no option of sbatch", "for example --sbatch account=NAME"
             )
         extra[name] = value
-    return Slurm(
-        Resources(options.partition, minutes, options.cpus, options.parallelism, warning, extra)
+    resources = Resources(
+        options.partition, minutes, options.cpus, options.parallelism, warning, extra
     )
+    return Slurm(resources) if options.cluster == "slurm" else Local(session.store, resources)
 
 
 def run_jobs(
@@ -115,6 +116,27 @@ def run_jobs(
         return submission.watch()
     finally:
         display.close()
+
+
+def ended_submissions(session: Session, grace_seconds: float) -> list[Path]:
+    """What gc may remove of the store's records of submissions."""
+    from irlcli.experiments.cluster.local import Local
+    from irlcli.experiments.cluster.records import ended
+    from irlcli.experiments.cluster.resources import Resources
+    from irlcli.experiments.cluster.slurm import Slurm
+
+    @cache
+    def states_at(place: str) -> Mapping[str, str] | None:
+        local = Local(session.store, Resources())
+        if place == local.place:
+            return local.states()
+        try:
+            slurm = Slurm(Resources())
+            return slurm.states() if place == slurm.place else None
+        except (UsageError, StageFailed):
+            return None
+
+    return ended(session.store, states_at, grace_seconds)
 
 
 def print_status(session: StageSession, found: "Plan", options: ClusterOptions) -> None:

@@ -1,11 +1,13 @@
 """``irl verify`` and ``irl gc``: damaged and unused artefacts."""
 
+from shutil import rmtree
 from typing import Annotated, Any
 
 import typer
 
 from irlcli import labels
 from irlcli.cli import console as out
+from irlcli.cli.cluster import ended_submissions
 from irlcli.cli.options import collecting_command, store_command
 from irlcli.cli.session import Session
 from irlcli.errors import IntegrityError, UsageError
@@ -116,29 +118,39 @@ def gc(
         float, typer.Option(min=0, help="Keep what is younger than this [days].")
     ] = 7.0,
 ) -> None:
-    """List or delete artefacts that no name depends on."""
+    """List or delete artefacts that no name depends on, and logs of a cluster's jobs."""
     if not grace_days >= 0:
         raise UsageError(f"--grace-days {grace_days} is not a number of days", "write 0 or more")
     session.check_exists()
     grace = grace_days * _DAY
     if delete:
         artefacts, work = session.store.collect(grace)
+        with session.store.working_on("submission", wait=False):
+            submissions = ended_submissions(session, grace)
+            for path in submissions:
+                rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     else:
+        submissions = ended_submissions(session, grace)
         with session.reading():
             artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
     size = sum(output.size for artefact in artefacts for output in artefact.manifest.outputs)
     if session.as_json:
         value = {"deleted": delete, "artefacts": [a.id for a in artefacts], "bytes": size}
-        out.print_json("gc", {**value, "work": [path.name for path in work]})
+        value |= {"work": [path.name for path in work]}
+        value |= {"submissions": [path.name for path in submissions]}
+        out.print_json("gc", value)
         return
     for artefact in artefacts:
         record = artefact.manifest.record
         out.print_data(f"{artefact.id}  {record.stage}  {labels.describe(record)}")
     for path in work:
         out.print_data(f"{path.name[:16]}  scratch of an interrupted run")
+    for path in submissions:
+        out.print_data(f"{path.name}  logs of jobs that have ended")
     verb = "removed" if delete else "would be removed (add --delete)"
+    logs = f", {_count(len(submissions), 'submission')}" if submissions else ""
     scratch = f" and scratch of {_count(len(work), 'run')}" if work else ""
-    out.print_note(f"{_count(len(artefacts), 'artefact')}, {size:,} bytes{scratch} {verb}")
+    out.print_note(f"{_count(len(artefacts), 'artefact')}, {size:,} bytes{logs}{scratch} {verb}")
 
 
 def _count(number: int, noun: str) -> str:

@@ -1,5 +1,6 @@
 """A table as a list of named steps, and what a store holds of each."""
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
@@ -15,7 +16,6 @@ from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
 from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
 from irlcli.stages.base import From, Request
-from irlcli.store import digest
 
 
 class Selection(NamedTuple):
@@ -191,9 +191,10 @@ class _Identities:
                 else source.sha256
                 for role, source in request.inputs.items()
             }
-            parameters = msgspec.to_builtins(request.parameters)
-            identity = digest([request.stage.name, request.stage.version, parameters, inputs])
-            self._known[id(request)] = request, identity
+            whole = [request.stage.name, request.stage.version, request.parameters, inputs]
+            # No key: canonical JSON would take a third of the time of planning 10,000 runs.
+            encoded = msgspec.json.encode(whole, order="deterministic")
+            self._known[id(request)] = request, hashlib.sha256(encoded).hexdigest()
         return self._known[id(request)][1]
 
 

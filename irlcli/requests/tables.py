@@ -64,7 +64,10 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     candidates: Sequence[float] | Literal["own"] = ()
     if choice.choose_penalty is not None:
         if table.kind != "comparison" or table.variants:
-            raise UsageError(f"{table.name} takes no --choose-penalty", "omit --choose-penalty")
+            hint = f"set airl.penalty_weight in [{table.name}.variants]" if table.variants else ""
+            raise UsageError(
+                f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
+            )
         candidates = arguments.weights(choice.choose_penalty)
     tag = choice.tag or (table.name if table.settings else session.profile)
     session.table_file = table.settings

@@ -131,6 +131,14 @@ class Cluster:
             lambda: set(self.say("sinfo", "-h", "-N", "-o", "%N %T").splitlines()) == everyone,
         )
 
+    def warn_at_preemption(self, warn: bool) -> None:
+        """Whether a preempted job gets the signal that it asked for before a time limit."""
+        lines = self._conf.read_text().splitlines()
+        lines = [line for line in lines if not line.startswith("SlurmctldParameters=")]
+        lines += ["SlurmctldParameters=preempt_send_user_signal"] if warn else []
+        self._conf.write_text("\n".join(lines) + "\n")
+        self.say("scontrol", "reconfigure")
+
     def start_controller(self) -> None:
         self._run("slurmctld", ["slurmctld", "-D", "-f", str(self._conf)])
 
@@ -145,11 +153,19 @@ class Cluster:
 
     def kill_node(self, name: str, jobs_too: bool) -> None:
         """SIGKILL to a slurmd: with its jobs, as a power cut, or without, as the kernel may do."""
-        found = _processes_of(name, self._conf) if jobs_too else []
-        for pid in [self._processes[name].pid, *found]:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        self._processes.pop(name).wait()
+        process = self._processes.pop(name)
+        process.kill()
+        process.wait()
+        # Again: a job that was being launched may have started processes meanwhile.
+        while jobs_too and (found := _processes_of(name, self._conf)):
+            for pid in found:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+
+    def running_on(self, node: str) -> list[str]:
+        """The ids of the steps' jobs that run on a node."""
+        options = ("--noheader", "--array", "--name=irl", "--states=R", f"--nodelist={node}")
+        return self.say("squeue", *options, "--format=%i").split()
 
     def say(self, *command: str) -> str:
         """What a Slurm command prints."""

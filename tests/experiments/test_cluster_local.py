@@ -11,6 +11,7 @@ import time
 import pytest
 from test_run import REWARDS, ROW, Runs
 
+from irlcli.experiments.cluster.records import Submitted, ended, new_record
 from irlcli.store import Store
 
 pytest.importorskip("submitit")
@@ -21,7 +22,7 @@ def runs(tmp_path):
     return Runs(tmp_path)
 
 
-def test_it_ends_in_the_ids_of_a_run_without_a_cluster(runs, tmp_path):
+def test_it_ends_in_the_ids_of_a_run_without_a_cluster(irl, runs, tmp_path):
     runs.run(tmp_path / "plain", "--jobs", "2", *REWARDS)
     plain, whole = runs.processes(), Store(tmp_path / "plain").ids()
     runs.log.write_text("")
@@ -32,6 +33,30 @@ def test_it_ends_in_the_ids_of_a_run_without_a_cluster(runs, tmp_path):
     runs.log.write_text("")
     errors = runs.run(store, "--cluster", "local", *REWARDS)
     assert "submitted" not in errors and runs.processes() == []
+    (submission,) = (store / ".jobs").iterdir()
+    young = irl("gc", "--delete", "--store", store)
+    assert young.code == 0 and submission.exists(), young.err
+    old = irl("gc", "--delete", "--grace-days", "0", "--store", store)
+    assert f"{submission.name}  logs of jobs that have ended" in old.out
+    assert not submission.exists() and Store(store).ids() == whole
+
+
+def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path):
+    store = Store(tmp_path)
+    store.create()
+    names = "waiting", "done", "elsewhere"
+    made = {name: new_record(store, f"the queue of {name}") for name in names}
+    for name, record in made.items():
+        record.add([Submitted("step", "identity", f"{name} 1")])
+    states = {"the queue of waiting": {"waiting 1": "PENDING"}, "the queue of done": {}}
+    leftover = store.jobs / "probe-1"
+    leftover.touch()
+    newer = store.jobs / "newer"
+    newer.mkdir()
+    (newer / "jobs-0000000.json").write_text('{"schema": 2}')
+    time.sleep(0.05)
+    assert ended(store, states.get, 3600.0) == []
+    assert set(ended(store, states.get, 0.0)) == {made["done"].directory, leftover.absolute()}
 
 
 def test_a_failure_stops_only_what_needs_it(runs, tmp_path):

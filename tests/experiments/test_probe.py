@@ -10,7 +10,8 @@ import pytest
 
 from irlcli.errors import StageFailed, UsageError
 from irlcli.experiments.cluster.probe import look
-from irlcli.experiments.cluster.slurm import Resources, Slurm, parse_minutes
+from irlcli.experiments.cluster.resources import Resources, parse_minutes
+from irlcli.experiments.cluster.slurm import Slurm
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def probe(tmp_path, monkeypatch):
         for path in tmp_path.glob("s*"):
             path.chmod(0o755)
         warnings = []
-        slurm = Slurm(Resources("P", 60, 1, 50, 90, {}))
+        slurm = Slurm(Resources("P"))
         (tmp_path / "runs").mkdir()
         slurm.probe(tmp_path / "runs", lambda: None, warnings.append)
         assert list((tmp_path / "runs" / ".jobs").iterdir()) == []

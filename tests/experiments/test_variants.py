@@ -173,6 +173,7 @@ def test_contradictory_options_name_the_variant(irl, tmp_path):
     assert several.code == 2 and "--methods: variants" in several.err
     chosen = irl("plan", "parts", *line, "--choose-penalty", "1,2")
     assert chosen.code == 2 and "takes no --choose-penalty" in chosen.err
+    assert "set airl.penalty_weight in [parts.variants]" in chosen.err
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from typing import Any
 
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import records
+from irlcli.experiments.cluster.resources import Resources
 from irlcli.store import Store
 
 
@@ -21,10 +22,9 @@ class Local:
     # Its jobs' ids are those of this machine's processes.
     place = f"local on {os.uname().nodename}"
 
-    def __init__(self, store: Store, minutes: int, warning: int):
+    def __init__(self, store: Store, resources: Resources):
         self._store = store
-        self._minutes = minutes
-        self._warning = warning
+        self._resources = resources
         self._jobs: dict[str, Any] = {}
 
     def submit(
@@ -35,7 +35,9 @@ class Local:
 
         assert not after and matching is None, "the local executor knows no dependencies"
         executor = submitit.LocalExecutor(folder=logs)
-        executor.update_parameters(timeout_min=self._minutes, signal_delay_s=self._warning)
+        executor.update_parameters(
+            timeout_min=self._resources.minutes, signal_delay_s=self._resources.warning
+        )
         started = [executor.submit(StepJob.run, job) for job in jobs]
         self._jobs |= {job.job_id: job for job in started}
         return [job.job_id for job in started]

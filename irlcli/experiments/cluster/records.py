@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from irlcli.store.durable import write_durably
 
 _FILE = "jobs-{:07}.json"
 _SCHEMA = 1
+_LONGEST_LINE = 1000
 
 
 class Submitted(NamedTuple):
@@ -72,13 +73,21 @@ class Record:
         except (FileNotFoundError, ValueError, TypeError):
             return None
 
-    def log(self, name: str) -> Path | None:
-        """The stderr of a step's job, if there is one."""
-        for submitted in reversed(self.jobs):
-            if submitted.name == name:
-                found = self.logs / f"{submitted.job}_0_log.err"
-                return found if found.exists() else None
-        return None
+    def log(self, job: str) -> Path | None:
+        """The stderr of a job, if there is one."""
+        found = self.logs / f"{job}_0_log.err"
+        return found if found.exists() else None
+
+    def last_line(self, job: str) -> str:
+        """What a job wrote last; empty if it wrote nothing yet."""
+        log = self.log(job)
+        lines: list[str] = []
+        with suppress(OSError):
+            if log is not None:
+                with open(log, "rb") as file:
+                    file.seek(max(0, log.stat().st_size - _LONGEST_LINE))
+                    lines = file.read().decode("utf-8", "replace").splitlines()
+        return lines[-1] if lines else ""
 
 
 def new_record(store: Store, place: str) -> Record:
@@ -91,16 +100,52 @@ def new_record(store: Store, place: str) -> Record:
     return record
 
 
-def records(store: Store, place: str) -> list[Record]:
-    """The submissions to the queue at ``place``, oldest first. What cannot be read is left out."""
+def records(store: Store, place: str | None = None) -> list[Record]:
+    """The submissions to the queue at ``place``, or to any, oldest first.
+
+    What cannot be read is left out.
+    """
     found: dict[Path, Record] = {}
     for path in sorted(store.jobs.absolute().glob("*/jobs-*.json")):
         with suppress(OSError, ValueError, KeyError, TypeError):
             value = json.loads(path.read_bytes())
-            if value["schema"] == _SCHEMA and value["place"] == place:
-                record = found.setdefault(path.parent, Record(path.parent, place, []))
+            if value["schema"] == _SCHEMA and place in (None, value["place"]):
+                record = found.setdefault(path.parent, Record(path.parent, value["place"], []))
                 record.jobs += [Submitted(**job) for job in value["jobs"]]
     return list(found.values())
+
+
+def ended(
+    store: Store, states_at: Callable[[str], Mapping[str, str] | None], grace_seconds: float
+) -> list[Path]:
+    """Directories and leftover files of submissions that have ended, unchanged for the grace period.
+
+    Args:
+        store: holds them.
+        states_at: the states of the jobs in the queue at a place, by id; None if it cannot be
+            asked from here, so that its submissions are kept.
+        grace_seconds: grace period [s].
+    """
+    limit = time.time() - grace_seconds
+    known = {record.directory: record for record in records(store)}
+    found = []
+    for path in sorted(store.jobs.absolute().glob("*")):
+        record = known.get(path)
+        if record is None and any(path.glob(_FILE.partition("{")[0] + "*")):
+            # A newer irlcli wrote it.
+            continue
+        if record is not None:
+            states = states_at(record.place)
+            if states is None or any(submitted.job in states for submitted in record.jobs):
+                continue
+        if _changed(path) < limit:
+            found.append(path)
+    return found
+
+
+def _changed(path: Path) -> float:
+    """When the directory ``path``, or a file in it, was last changed [s since 1970]."""
+    return max((p.stat().st_mtime for p in path.rglob("*")), default=path.stat().st_mtime)
 
 
 def remove_ended(found: list[Record], states: Mapping[str, str]) -> list[Record]:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -10,59 +11,15 @@ import time
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from irlcli.errors import StageFailed, UsageError
 from irlcli.experiments.cluster.job import StepJob
+from irlcli.experiments.cluster.resources import Resources
 
 JOB_NAME = "irl"
 _CLOCK_SECONDS = 60.0
 _LOW_BYTES = 1 << 30
-
-
-class Resources(NamedTuple):
-    """What every job asks Slurm for.
-
-    Attributes:
-        minutes: time limit.
-        cpus: per job.
-        parallelism: elements of an array that run at a time.
-        warning: how long before the time limit a job is warned [s].
-        extra: other options of sbatch, by name.
-    """
-
-    partition: str | None
-    minutes: int
-    cpus: int
-    parallelism: int
-    warning: int
-    extra: dict[str, str]
-
-    def words(self) -> list[str]:
-        """The options of srun for the same place."""
-        words = [f"--{name}={value}" for name, value in self.extra.items()]
-        return words if self.partition is None else [f"--partition={self.partition}", *words]
-
-
-def parse_minutes(text: str) -> int:
-    """A time limit as Slurm writes it (``90``, ``4:00:00``, ``1-12``), in whole minutes.
-
-    Raises:
-        UsageError: not a time limit.
-    """
-    found = re.fullmatch(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?", text)
-    if not found:
-        raise UsageError(f"--time {text!r} is not a time limit", "for example 4:00:00, or 1-12")
-    days, first, second, third = (int(part) if part else 0 for part in found.groups())
-    if found[1]:
-        seconds = days * 86400 + first * 3600 + second * 60 + third
-    elif found[4]:
-        seconds = first * 3600 + second * 60 + third
-    else:
-        seconds = first * 60 + second
-    if seconds < 60:
-        raise UsageError(f"--time {text} is less than a minute", "for example 4:00:00")
-    return -(-seconds // 60)
 
 
 class Slurm:
@@ -119,18 +76,23 @@ class Slurm:
 
         conditions = [f"afterok:{':'.join(after)}"] if after else []
         conditions += [f"aftercorr:{matching}"] if matching else []
-        more: dict[str, Any] = {"requeue": True, "kill-on-invalid-dep": "yes"}
+        more: dict[str, Any] = {
+            "requeue": True,
+            "kill-on-invalid-dep": "yes",
+            # B: to the batch script, which becomes the job itself.
+            "signal": f"B:USR2@{self._resources.warning}",
+        }
         more |= self._resources.extra
-        executor = submitit.SlurmExecutor(folder=logs)
+        # Without srun: a node that dies while srun launches a task would end the job as failed
+        # instead of putting it back into the queue.
+        executor = submitit.SlurmExecutor(logs, python=f"exec {shlex.quote(sys.executable)}")
         executor.update_parameters(
             job_name=JOB_NAME,
             partition=self._resources.partition,
             time=self._resources.minutes,
             cpus_per_task=self._resources.cpus,
-            # From 22.05 on, srun does not take this from sbatch.
-            srun_args=[f"--cpus-per-task={self._resources.cpus}"],
+            use_srun=False,
             array_parallelism=self._resources.parallelism,
-            signal_delay_s=self._resources.warning,
             dependency=",".join(conditions) or None,
             additional_parameters=more,
             wckey=None,

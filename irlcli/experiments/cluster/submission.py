@@ -92,9 +92,13 @@ def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
             if job in states:
                 by_identity[identity] = by_name[name] = Queued(job, states[job], record)
     found = {}
-    for name in plan.tasks:
-        # After a lambda was chosen, a reward is another request under the same name.
-        there = by_identity.get(plan.identities[name]) or by_name.get(name)
+    changing: set[str] = set()
+    for name, task in plan.tasks.items():
+        there = by_identity.get(plan.identities[name])
+        if task.request.stage == choose_penalty.STAGE or not changing.isdisjoint(plan.needs[name]):
+            # Once a lambda is chosen, the reward is another request under the same name.
+            changing.add(name)
+            there = there or by_name.get(name)
         if there is not None:
             found[name] = there
     return found
@@ -193,9 +197,11 @@ class Submission:
                             alive.remove(name)
                         continue
                     gone.pop(name, None)
-                    if state.startswith("RUNNING") and name not in running:
-                        running[name] = time.monotonic()
-                        self._display.start(name)
+                    if state.startswith("RUNNING"):
+                        if name not in running:
+                            running[name] = time.monotonic()
+                            self._display.start(name)
+                        self._show_progress(name)
                 if alive:
                     self._pause(time.monotonic() - started)
                 elif not self._any_ready():
@@ -287,7 +293,7 @@ class Submission:
         self._lost.add(name)
         if all(self._exists(need) for need in self._plan.needs[name]):
             if failure is None:
-                log = self._records[name].log(name)
+                log = self._records[name].log(self._ids[name])
                 failure = Failure(
                     1,
                     f"job {self._ids[name]} ended without a result: cancelled or killed",
@@ -296,6 +302,12 @@ class Submission:
             self._outcome.failed[name] = failure
             self._display.failed(name, failure)
         return True
+
+    def _show_progress(self, name: str) -> None:
+        line = self._records[name].last_line(self._ids[name])
+        # Of a stage's lines, those that say how far it is are indented.
+        if line.startswith("  "):
+            self._display.line(name, line)
 
     def _pause(self, elapsed: float) -> None:
         """Ask Slurm seldom when jobs are long."""

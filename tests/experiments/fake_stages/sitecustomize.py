@@ -3,7 +3,8 @@
 It logs the process, and replaces what the stages compute by rounds of a hash chain: real command
 lines, processes, locks and checkpoints, without the cost of training. Environment variables:
 IRL_TEST_LOG is the log, a JSON document per line; IRL_TEST_FAIL is the agent or method that fails;
-IRL_TEST_ROUND is how long a round takes [s].
+IRL_TEST_ROUND is how long a round takes [s]; IRL_TEST_AHEAD is a node of Slurm and how far its clock
+is ahead [s].
 """
 
 import atexit
@@ -58,6 +59,14 @@ def install():
     )
 
 
+def shift_clock(node, seconds):
+    if os.environ.get("SLURMD_NODENAME") == node:
+        true_time = time.time
+        time.time = lambda: true_time() + float(seconds)
+
+
+if "IRL_TEST_AHEAD" in os.environ:
+    shift_clock(*os.environ["IRL_TEST_AHEAD"].split())
 if "IRL_TEST_LOG" in os.environ and "irlcli" in sys.orig_argv:
     log(argv=sys.orig_argv)
     atexit.register(log, exits=True)  # a killed process does not
