@@ -7,6 +7,7 @@ starts one, prints the environment variables that its commands need, and stops i
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -75,22 +76,27 @@ _PATH = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
 class Cluster:
     """One controller, ``nodes`` nodes, and a node ``blind`` that does not see ``hidden``.
 
+    ``mount`` is a shell command that each of the others runs in a mount namespace of its own.
+
     Attributes:
         environment: for the commands that use it.
     """
 
-    def __init__(self, directory: Path, hidden: Path, nodes: int = 2, cpus: int = 4):
+    def __init__(
+        self, directory: Path, hidden: Path, nodes: int = 2, cpus: int = 4, mount: str | None = None
+    ):
         self.directory = directory
-        self._hidden = hidden
         self._names = [f"n{i + 1}" for i in range(nodes)]
+        self._mounts = dict.fromkeys(self._names, mount)
+        self._mounts["blind"] = f"mount -t tmpfs none {hidden}"
         self._processes: dict[str, subprocess.Popen] = {}
         self._ports = _free_ports(nodes + 2)
-        for name in ("state", *(f"spool.{n}" for n in [*self._names, "blind"])):
+        for name in ("state", *(f"spool.{n}" for n in self._mounts)):
             (directory / name).mkdir(parents=True)
         host = os.uname().nodename
         lines = [
             f"NodeName={name} NodeHostname={host} Port={port} CPUs={cpus} RealMemory=1000 State=UNKNOWN"
-            for name, port in zip([*self._names, "blind"], self._ports[1:], strict=True)
+            for name, port in zip(self._mounts, self._ports[1:], strict=True)
         ]
         self._conf = directory / "slurm.conf"
         self._conf.write_text(
@@ -120,12 +126,9 @@ class Cluster:
         self._run("munged", munge)
         self._wait("munged", (self.directory / "munge.socket").exists)
         self.start_controller()
-        for name in self._names:
+        for name in self._mounts:
             self.start_node(name)
-        # A mount of its own hides the directory from this node.
-        blind = f"mount -t tmpfs none {self._hidden} && exec slurmd -D -N blind -f {self._conf}"
-        self._run("blind", ["unshare", "--mount", "--propagation", "private", "sh", "-c", blind])
-        everyone = {f"{name} idle" for name in [*self._names, "blind"]}
+        everyone = {f"{name} idle" for name in self._mounts}
         self._wait(
             "the nodes",
             lambda: set(self.say("sinfo", "-h", "-N", "-o", "%N %T").splitlines()) == everyone,
@@ -149,7 +152,12 @@ class Cluster:
         process.wait()
 
     def start_node(self, name: str) -> None:
-        self._run(name, ["slurmd", "-D", "-N", name, "-f", str(self._conf)])
+        command = ["slurmd", "-D", "-N", name, "-f", str(self._conf)]
+        mount = self._mounts[name]
+        if mount is not None:
+            private = ["unshare", "--mount", "--propagation", "private"]
+            command = [*private, "sh", "-c", f"{mount} && exec {shlex.join(command)}"]
+        self._run(name, command)
 
     def kill_node(self, name: str, jobs_too: bool) -> None:
         """SIGKILL to a slurmd: with its jobs, as a power cut, or without, as the kernel may do."""
@@ -180,7 +188,7 @@ class Cluster:
         while self.say("squeue", "--noheader") and time.monotonic() < limit:
             self.say("scancel", "--user=root")
             time.sleep(0.5)
-        for name in [*self._names, "blind"]:
+        for name in self._mounts:
             for pid in _processes_of(name, self._conf):
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)

@@ -12,6 +12,7 @@ import errno
 import json
 import os
 import random
+import shlex
 import shutil
 import subprocess
 import sys
@@ -287,6 +288,43 @@ def test_without_locks_on_the_shared_disk(runs, whole, tmp_path):
     assert errors.count("without locks") == 1
     assert set(runs.computed().values()) == {1}
     assert set(whole) < set(Store(runs.store).ids())
+
+
+def test_every_machine_with_its_own_mount_of_a_store_on_the_network(tmp_path, whole):
+    """SFTP: each mount has caches of its own, and no lock of one is seen by another."""
+    server = Path("/usr/lib/openssh/sftp-server")
+    if shutil.which("sshfs") is None or not server.exists():
+        pytest.skip("needs sshfs and openssh-sftp-server")
+    for name in ("hidden", "served", "mounted"):
+        (tmp_path / name).mkdir()
+    connect = tmp_path / "connect"
+    connect.write_text(f"#!/bin/sh\nexec {server}\n")
+    connect.chmod(0o755)
+    served, mounted = tmp_path / "served", tmp_path / "mounted"
+    sshfs = f"sshfs -f -o ssh_command={connect} server:{served} {mounted}"
+    ready = f"until mountpoint --quiet {mounted}; do sleep 0.1; done"
+    mount = f"setpriv --pdeathsig TERM {sshfs} & {ready}"
+    cluster = Cluster(tmp_path / "slurm", tmp_path / "hidden", mount=mount)
+    here = None
+    try:
+        cluster.start()
+        here = subprocess.Popen(shlex.split(sshfs))
+        subprocess.run(ready, shell=True, check=True)
+        runs = Runs(tmp_path / "runs", cluster)
+        runs.store = mounted / "store"
+        first = runs.submit("--tag", "first", **SLOW)
+        second = runs.submit("--tag", "second", name="other", **SLOW)
+        done(first)
+        done(second)
+        assert set(runs.computed().values()) == {1}
+        ids = Store(served / "store").ids()
+        assert set(whole) < set(ids) and Store(served / "store").verify(ids) == {}
+        assert "submitted" not in done(runs.submit())
+    finally:
+        cluster.stop()
+        if here is not None:
+            here.terminate()
+            here.wait()
 
 
 def test_a_time_limit_ends_in_a_checkpoint_and_another_turn(runs):
