@@ -9,8 +9,8 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "irlcli"
 HEAVY = {
-    *("torch", "stable_baselines3", "gymnasium", "pybullet", "pybullet_data", "pandas", "pyarrow"),
-    *("Box2D", "scipy", "matplotlib", "PIL"),
+    *("torch", "stable_baselines3", "gymnasium", "pybullet", "pybullet_data", "mujoco"),
+    *("pandas", "pyarrow", "Box2D", "scipy", "matplotlib", "PIL"),
 }
 FILES = {
     *("irlcli.data.tensors", "irlcli.data.parquet", "irlcli.data.demonstrations"),

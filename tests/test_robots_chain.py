@@ -137,7 +137,7 @@ def test_play_refuses_a_damaged_policy(chains, irl, tmp_path):
         (["evaluate", "--idle", "--env", "ant", "--ood", "friction=1"], "as triple"),
         (
             ["evaluate", "--idle", "--env", "ant", "--ood", "gravity=2x"],
-            "'gravity' belongs to reacher",
+            "'gravity' belongs to mujoco-ant",
         ),
         (["evaluate", "--idle", "--env", "reacher", "--ood", "gravity", "--workers", "0"], "0"),
     ],

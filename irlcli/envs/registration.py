@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -76,11 +77,16 @@ def build(
 
     Raises:
         UsageError: as :func:`make`, or spaces that no policy here has.
-        StageFailed: the environment's code changed since it was planned or imported.
+        StageFailed: a library is missing, or the environment's code changed since it was planned or
+            imported.
     """
     if render_mode is not None:
         arguments = arguments | {"render_mode": render_mode}
     if spec.own is None:
+        if spec.needs is not None and find_spec(spec.needs.module) is None:
+            raise StageFailed(
+                f"{spec.name} needs {spec.needs.name}, which is not installed", spec.needs.hint
+            )
         # Environments that were added since this module was imported.
         register()
         return gymnasium.make(spec.gym_id, **arguments).unwrapped

@@ -10,12 +10,14 @@ from irlcli.envs.ant.spec import SPEC as ANT
 from irlcli.envs.gridworld.spec import SPEC as GRIDWORLD
 from irlcli.envs.half_cheetah.spec import SPEC as HALF_CHEETAH
 from irlcli.envs.lunar_lander.spec import SPEC as LUNAR_LANDER
+from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
 from irlcli.envs.reacher.spec import SPEC as REACHER
 from irlcli.envs.spec import EnvironmentSpec
 from irlcli.errors import UsageError, suggest
 
 ENVIRONMENTS: dict[str, EnvironmentSpec] = {
-    spec.name: spec for spec in (LUNAR_LANDER, ANT, HALF_CHEETAH, REACHER, GRIDWORLD)
+    spec.name: spec
+    for spec in (LUNAR_LANDER, ANT, HALF_CHEETAH, REACHER, *MUJOCO_ROBOTS, GRIDWORLD)
 }
 BUILT_IN = tuple(ENVIRONMENTS)
 # Environments from outside the package that this process knows.

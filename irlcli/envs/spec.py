@@ -69,6 +69,20 @@ class Code(NamedTuple):
     version: str | None
 
 
+class Needs(NamedTuple):
+    """A library that an environment needs and that may be missing.
+
+    Attributes:
+        module: the name under which it is imported.
+        name: its own name.
+        hint: how to install it, or what works instead.
+    """
+
+    module: str
+    name: str
+    hint: str
+
+
 class Own(NamedTuple):
     """What an environment from outside the package has, and a built-in one has not.
 
@@ -113,6 +127,7 @@ class EnvironmentSpec(NamedTuple):
         transition_reward: ``module:function`` of the true reward [B] as a function of
             observations, actions and next observations, where it is one; else None.
         unobserved: what the true reward depends on besides them, as the end of a sentence.
+        needs: a library that may be missing.
         own: of an environment from outside the package; its ``entry_point`` or ``gym_id`` is empty.
     """
 
@@ -126,4 +141,5 @@ class EnvironmentSpec(NamedTuple):
     physics: int = 1
     transition_reward: str | None = None
     unobserved: str = "an unknown quantity"
+    needs: Needs | None = None
     own: Own | None = None

@@ -26,10 +26,15 @@ _LIBRARIES = (
     "gymnasium",
     "Box2D",
     "pybullet",
+    "mujoco",
     "pyarrow",
     "msgspec",
     "matplotlib",
 )
+
+
+# Not everyone has them. What was made without one of them does not depend on it.
+_OPTIONAL = ("mujoco",)
 
 
 class Attempt(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,9 +92,12 @@ def decode(data: bytes, stage: str, stage_version: int) -> tuple[Header, bytes]:
 def differing(recorded: Mapping[str, str | None]) -> list[str]:
     """The libraries whose version differs from the one present, as ``torch 2.6.0 (now 2.13.0)``."""
     present = libraries()
+    missing = {
+        name for name in _OPTIONAL if recorded.get(name) is None or present.get(name) is None
+    }
     return [
         f"{name} {recorded.get(name)} (now {present.get(name)})"
-        for name in sorted({*present, *recorded})
+        for name in sorted({*present, *recorded} - missing)
         if recorded.get(name) != present.get(name)
     ]
 

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from irlcli.envs.bullet.body import single
+from irlcli.envs.checks import require
 
 Friction = tuple[float, float, float]
 Model = Literal["merged", "original"]
-
-
-def require(name: str, value: Any, low: float, high: float) -> float:
-    """Return ``value`` as a float.
-
-    Raises:
-        ValueError: ``value`` is not a number in [low, high].
-    """
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not low <= number <= high:
-        raise ValueError(f"{name} must lie in [{low:g}, {high:g}], not {value!r}")
-    return number
 
 
 def require_friction(friction: Sequence[float]) -> Friction:

@@ -13,6 +13,7 @@ import numpy as np
 from irlcli.envs.bullet.body import Vector
 from irlcli.envs.bullet.robot import Robot
 from irlcli.envs.bullet.world import TIME_STEP, World, has_display
+from irlcli.envs.checks import clipped, is_finite
 
 _NOT_FINITE = "the state of the world is not finite"
 
@@ -90,11 +91,11 @@ class RobotEnv(gymnasium.Env, abc.ABC):
         Raises:
             ValueError: an action of a wrong shape, or not finite.
         """
-        action = _clipped(action, self.torques.shape)
+        action = clipped(action, self.torques.shape)
         self._robot.drive(self.torques * action)
         self._world.step()
         observation, potential = self._observe()
-        if not (math.isfinite(potential) and _is_finite(observation)):
+        if not (math.isfinite(potential) and is_finite(observation)):
             return self._observation, 0.0, False, True, {"error": _NOT_FINITE}
         reward, info = self._reward(action, observation, potential - self._potential)
         self._observation = observation
@@ -112,26 +113,6 @@ class RobotEnv(gymnasium.Env, abc.ABC):
     def close(self) -> None:
         """Disconnect from Bullet."""
         self._world.close()
-
-
-def _is_finite(array: np.ndarray) -> bool:
-    """Whether every entry of a vector is finite, and small enough to be squared."""
-    # The dot product is much cheaper than ``np.isfinite(array).all()``.
-    return math.isfinite(array.dot(array))
-
-
-def _clipped(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """``action`` as float64, clipped to the actuators' range [-1, 1].
-
-    Raises:
-        ValueError: ``action`` does not have ``shape``, or is not finite.
-    """
-    action = np.asarray(action, dtype=np.float64)
-    if action.shape != shape:
-        raise ValueError(f"action must have shape {shape}, not {action.shape}")
-    if not _is_finite(action):
-        raise ValueError(f"action must be finite, not {action.tolist()}")
-    return np.minimum(np.maximum(action, -1.0), 1.0)
 
 
 def _start_positions(options: dict[str, Any] | None, size: int) -> np.ndarray | None:

@@ -1,0 +1,43 @@
+"""Checks of the numbers that the robot environments take."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+
+def require(name: str, value: Any, low: float, high: float) -> float:
+    """Return ``value`` as a float.
+
+    Raises:
+        ValueError: ``value`` is not a number in [low, high].
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not low <= number <= high:
+        raise ValueError(f"{name} must lie in [{low:g}, {high:g}], not {value!r}")
+    return number
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Whether every entry of a vector is finite, and small enough to be squared."""
+    # The dot product is much cheaper than ``np.isfinite(array).all()``.
+    return math.isfinite(array.dot(array))
+
+
+def clipped(action: np.ndarray, shape: tuple[int, ...], bound: float = 1.0) -> np.ndarray:
+    """``action`` as float64, clipped to the actuators' range [-bound, bound].
+
+    Raises:
+        ValueError: ``action`` does not have ``shape``, or is not finite.
+    """
+    action = np.asarray(action, dtype=np.float64)
+    if action.shape != shape:
+        raise ValueError(f"action must have shape {shape}, not {action.shape}")
+    if not is_finite(action):
+        raise ValueError(f"action must be finite, not {action.tolist()}")
+    return np.minimum(np.maximum(action, -bound), bound)
