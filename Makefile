@@ -54,7 +54,8 @@ test: $(READY)
 	$(VENV)/bin/python -m pytest -n 2
 
 test-cluster: $(READY)
-	command -v slurmctld > /dev/null || apt-get install --yes --no-install-recommends slurm-wlm munge
+	command -v slurmctld > /dev/null && command -v sshfs > /dev/null || \
+	    apt-get install --yes --no-install-recommends slurm-wlm munge sshfs openssh-sftp-server
 	IRL_TEST_CLUSTER=1 $(VENV)/bin/python -m pytest tests/cluster
 
 lint: $(READY)
@@ -107,6 +108,7 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.workers
 	$(VENV)/bin/python -m benchmarks.data
 	$(VENV)/bin/python -m benchmarks.sharing
+	$(VENV)/bin/python -m benchmarks.cluster
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
 	else echo "skipped benchmarks.bullet_step: it counts instructions with valgrind"; fi
 

@@ -54,6 +54,7 @@ def main() -> None:
         submit(plan, store)
         fill(plan, store)
         report("plan, full store", [*IRL, "plan", "big", *words])
+        report("irl run, nothing missing", [*IRL, "run", "big", "--until", "returns", *words])
         last = list(plan.tasks)[-1]
         report("irl run --only, one step", [*IRL, "run", "big", "--only", last, *words])
         report("gc, dry run", [*IRL, "gc", "--store", str(place / "runs")])
@@ -104,7 +105,7 @@ def fill(plan: Plan, store: Store) -> None:
             if isinstance(source, From) and source.output is not None:
                 read_later[id(source.request)].add(source.output)
     started = time.monotonic()
-    for task in plan.tasks.values():
+    for name, task in plan.tasks.items():
         record = plan.lookup.record(task.request)
         data = record.key.encode()
         output_digest = hashlib.sha256(data).hexdigest()
@@ -118,6 +119,7 @@ def fill(plan: Plan, store: Store) -> None:
         (directory / "provenance.json").write_bytes(encode_provenance(manifest.id, {}))
         (directory / "manifest.json").write_bytes(manifest.encode())
         (store.root / ".keys" / record.key).write_text(manifest.id[:16])
+        (store.root / ".names" / name).write_text(manifest.id[:16])
         (store.root / ".locks" / record.key).touch()
     print(f"wrote {len(plan.tasks):,} artefacts in {time.monotonic() - started:.0f} s")
 

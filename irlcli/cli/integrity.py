@@ -1,6 +1,5 @@
 """``irl verify`` and ``irl gc``: damaged and unused artefacts."""
 
-from shutil import rmtree
 from typing import Annotated, Any
 
 import typer
@@ -121,14 +120,15 @@ def gc(
     """List or delete artefacts that no name depends on, and logs of a cluster's jobs."""
     if not grace_days >= 0:
         raise UsageError(f"--grace-days {grace_days} is not a number of days", "write 0 or more")
+    from irlcli.experiments.cluster.records import remove
+
     session.check_exists()
     grace = grace_days * _DAY
     if delete:
         artefacts, work = session.store.collect(grace)
         with session.store.working_on("submission", wait=False):
             submissions = ended_submissions(session, grace)
-            for path in submissions:
-                rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            remove(submissions)
     else:
         submissions = ended_submissions(session, grace)
         with session.reading():

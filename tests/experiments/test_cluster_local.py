@@ -41,6 +41,14 @@ def test_it_ends_in_the_ids_of_a_run_without_a_cluster(irl, runs, tmp_path):
     assert not submission.exists() and Store(store).ids() == whole
 
 
+def test_the_log_of_a_job_ends_in_how_far_it_is(tmp_path):
+    record = new_record(Store(tmp_path), "here")
+    assert record.last_line("7") == ""
+    log = record.logs / "7_0_log.err"
+    log.write_text("RUN expert\n" + "x" * 5000 + "\n  expert: 512/1,024 steps\n")
+    assert record.last_line("7") == "  expert: 512/1,024 steps"
+
+
 def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path):
     store = Store(tmp_path)
     store.create()

@@ -55,7 +55,7 @@ class StepJob(NamedTuple):
             return
         if code in _ANOTHER_TURN:
             if not _is_running(received):
-                # scancel: the checkpoint has been written, and nobody wants another turn.
+                # After scancel nobody wants another turn; after a preemption Slurm gives one.
                 sys.exit(Interrupted.exit_code)
             turns = self._turns()
             if turns < self.requeues:

@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -148,12 +148,10 @@ def _changed(path: Path) -> float:
     return max((p.stat().st_mtime for p in path.rglob("*")), default=path.stat().st_mtime)
 
 
-def remove_ended(found: list[Record], states: Mapping[str, str]) -> list[Record]:
-    """Remove the directories of submissions without a job in the queue; returns the others."""
-    kept = []
-    for record in found:
-        if any(submitted.job in states for submitted in record.jobs):
-            kept.append(record)
+def remove(found: Iterable[Path]) -> None:
+    """Remove what :func:`ended` found."""
+    for path in found:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
         else:
-            shutil.rmtree(record.directory, ignore_errors=True)
-    return kept
+            path.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ class Slurm:
         for start in range(0, len(listed), 500):
             _say("scancel", *listed[start : start + 500])
 
-    def probe(self, store: Path, waiting: Any, warn: Any) -> None:
+    def probe(self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]) -> None:
         """Run a job that looks at the store from a node, and wait for it.
 
         Raises:

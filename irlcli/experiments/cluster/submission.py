@@ -11,9 +11,10 @@ from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import (
     Record,
     Submitted,
+    ended,
     new_record,
     records,
-    remove_ended,
+    remove,
 )
 from irlcli.experiments.execute import Display, Outcome
 from irlcli.experiments.failures import Failure
@@ -155,7 +156,8 @@ class Submission:
             if not new:
                 return 0
             self._queue.probe(store.root, waiting, warn)
-            remove_ended(records(store, self._queue.place), self._queue.states())
+            states = {self._queue.place: self._queue.states()}
+            remove(ended(store, states.get, 0.0))
             needs = {name: [n for n in self._plan.needs[name] if n in missing] for name in new}
             self._arrays = job_arrays(needs)
             self._waiting = list(self._arrays)
