@@ -54,9 +54,9 @@ def main() -> None:
         submit(plan, store)
         fill(plan, store)
         report("plan, full store", [*IRL, "plan", "big", *words])
-        report("irl run, nothing missing", [*IRL, "run", "big", "--until", "returns", *words])
+        report("run, nothing missing", [*IRL, "run", "big", "--until", "returns", *words])
         last = list(plan.tasks)[-1]
-        report("irl run --only, one step", [*IRL, "run", "big", "--only", last, *words])
+        report("run --only, one step", [*IRL, "run", "big", "--only", last, *words])
         report("gc, dry run", [*IRL, "gc", "--store", str(place / "runs")])
         claims(store)
 
