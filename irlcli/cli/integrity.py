@@ -120,13 +120,13 @@ def gc(
     """List or delete artefacts that no name depends on, and logs of a cluster's jobs."""
     if not grace_days >= 0:
         raise UsageError(f"--grace-days {grace_days} is not a number of days", "write 0 or more")
-    from irlcli.experiments.cluster.records import remove
+    from irlcli.experiments.cluster.records import LOCK, remove
 
     session.check_exists()
     grace = grace_days * _DAY
     if delete:
         artefacts, work = session.store.collect(grace)
-        with session.store.working_on("submission", wait=False):
+        with session.store.working_on(LOCK, wait=False):
             submissions = ended_submissions(session, grace)
             remove(submissions)
     else:

@@ -22,13 +22,20 @@ def runs(tmp_path):
     return Runs(tmp_path)
 
 
-def test_it_ends_in_the_ids_of_a_run_without_a_cluster(irl, runs, tmp_path):
-    runs.run(tmp_path / "plain", "--jobs", "2", *REWARDS)
-    plain, whole = runs.processes(), Store(tmp_path / "plain").ids()
-    runs.log.write_text("")
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """The ids and the processes of a run without a cluster."""
+    directory = tmp_path_factory.mktemp("plain")
+    runs = Runs(directory)
+    runs.run(directory / "runs", "--jobs", "8", *REWARDS)
+    return Store(directory / "runs").ids(), sorted(runs.processes())
+
+
+def test_it_ends_in_the_ids_of_a_run_without_a_cluster(irl, plain, runs, tmp_path):
+    whole, processes = plain
     store = tmp_path / "runs"
     errors = runs.run(store, "--cluster", "local", "--jobs", "4", *REWARDS)
-    assert Store(store).ids() == whole and sorted(runs.processes()) == sorted(plain)
+    assert Store(store).ids() == whole and sorted(runs.processes()) == processes
     assert "6 jobs submitted" in errors and f"RUN {ROW}.irm.0" in errors
     runs.log.write_text("")
     errors = runs.run(store, "--cluster", "local", *REWARDS)
@@ -87,10 +94,8 @@ def test_a_failure_stops_only_what_needs_it(runs, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(runs, tmp_path):
+def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_path):
     """SIGUSR2 is what Slurm sends before a time limit, SIGTERM what it sends before a preemption."""
-    runs.run(tmp_path / "plain", "--jobs", "2", "--until", "experts")
-    runs.log.write_text("")
     store = tmp_path / "runs"
     line = (store, "--cluster", "local", "--jobs", "3", "--until", "experts")
     process = runs.start(*line, IRL_TEST_ROUND="0.5")
@@ -103,7 +108,8 @@ def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(runs, tmp_path):
             os.kill(pid, number)
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 0, errors
-    assert Store(store).ids() == Store(tmp_path / "plain").ids()
+    experts = Store(store).ids()
+    assert len(experts) == 3 and set(experts) < set(plain[0])
     assert max(runs.computed().values()) == 2
 
 

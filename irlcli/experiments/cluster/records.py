@@ -17,6 +17,8 @@ from irlcli.experiments.failures import Failure
 from irlcli.store import Store
 from irlcli.store.durable import write_durably
 
+# Held, as a key is, by whoever submits jobs or removes records.
+LOCK = "submission"
 _FILE = "jobs-{:07}.json"
 _SCHEMA = 1
 _LONGEST_LINE = 1000

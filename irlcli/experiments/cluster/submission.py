@@ -9,6 +9,7 @@ from irlcli.errors import StageFailed
 from irlcli.experiments.cluster.arrays import Array, job_arrays
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import (
+    LOCK,
     Record,
     Submitted,
     ended,
@@ -146,7 +147,7 @@ class Submission:
         self._display.begin(len(self._plan.tasks), len(self._plan.tasks) - len(missing))
         if not missing:
             return 0
-        with store.working_on("submission", wait=True):
+        with store.working_on(LOCK, wait=True):
             there = queued(self._plan, self._queue, store)
             for name in missing:
                 if name in there:
