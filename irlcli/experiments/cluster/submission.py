@@ -138,7 +138,6 @@ class Submission:
         """Submit what is missing and not in the queue; returns how many jobs that are.
 
         Raises:
-            Busy: another process is submitting to this store.
             UsageError, StageFailed: Slurm refuses the jobs, or a node cannot use the store.
         """
         store = self._runner.store
