@@ -76,7 +76,7 @@ _PATH = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
 class Cluster:
     """One controller, ``nodes`` nodes, and a node ``blind`` that does not see ``hidden``.
 
-    ``mount`` is a shell command that each of the others runs in a mount namespace of its own.
+    With ``mount``, a shell command, each of the others has a host name and mounts of its own.
 
     Attributes:
         environment: for the commands that use it.
@@ -155,8 +155,9 @@ class Cluster:
         command = ["slurmd", "-D", "-N", name, "-f", str(self._conf)]
         mount = self._mounts[name]
         if mount is not None:
-            private = ["unshare", "--mount", "--propagation", "private"]
-            command = [*private, "sh", "-c", f"{mount} && exec {shlex.join(command)}"]
+            private = ["unshare", "--uts", "--mount", "--propagation", "private"]
+            line = f"hostname {name}; {mount} && exec {shlex.join(command)}"
+            command = [*private, "sh", "-c", line]
         self._run(name, command)
 
     def kill_node(self, name: str, jobs_too: bool) -> None:

@@ -314,13 +314,14 @@ def test_every_machine_with_its_own_mount_of_a_store_on_the_network(tmp_path, wh
         runs = Runs(tmp_path / "runs", cluster)
         runs.store = mounted / "store"
         first = runs.submit("--tag", "first", **SLOW)
-        second = runs.submit("--tag", "second", name="other", **SLOW)
+        # On the login node: it sees the jobs by their claims only.
+        second = runs.table("--jobs", "2", "--tag", "second", *UNTIL, name="other", **SLOW)
         done(first)
-        done(second)
+        assert "on n" in done(second)
         assert set(runs.computed().values()) == {1}
         ids = Store(served / "store").ids()
         assert set(whole) < set(ids) and Store(served / "store").verify(ids) == {}
-        assert "submitted" not in done(runs.submit())
+        assert "submitted" not in done(runs.submit("--tag", "first"))
     finally:
         cluster.stop()
         if here is not None:
