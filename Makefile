@@ -106,11 +106,12 @@ bench: $(READY)
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
 	$(VENV)/bin/python -m benchmarks.workers
+	$(VENV)/bin/python -m benchmarks.mujoco_threads
 	$(VENV)/bin/python -m benchmarks.data
 	$(VENV)/bin/python -m benchmarks.sharing
 	$(VENV)/bin/python -m benchmarks.cluster
-	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.bullet_step; \
-	else echo "skipped benchmarks.bullet_step: it counts instructions with valgrind"; fi
+	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.robot_step; \
+	else echo "skipped benchmarks.robot_step: it counts instructions with valgrind"; fi
 
 # The long form of tests/torture: each theme is a script that prints its figures. Takes over an hour.
 TORTURE ?= crash concurrency growth determinism fuzz

@@ -102,3 +102,23 @@ def test_a_missing_library_is_one_line_with_the_command_that_installs_it(
     error, hint = done.err.splitlines()[-2:]
     assert error.endswith(f": {robot} needs MuJoCo, which is not installed")
     assert hint == "hint: pip install 'irlcli[mujoco]'"
+
+
+def test_a_broken_library_is_one_line_too(tmp_path, irl, monkeypatch):
+    """MuJoCo reads MUJOCO_GL when it is imported, and raises what OpenGL's bindings raise."""
+
+    def broken(name):
+        raise AttributeError("'NoneType' object has no attribute 'glGetError'")
+
+    monkeypatch.setattr("irlcli.envs.registration.import_module", broken)
+    done = irl("evaluate", "--idle", "--env", HOPPER, "--ood", "mass=1x", "--store", tmp_path)
+    assert done.code == 1 and "which cannot be imported: 'NoneType' object" in done.err
+    assert "Traceback" not in done.err
+
+
+def test_pybullet_robots_say_what_works_without_pybullet(tmp_path, irl, monkeypatch):
+    monkeypatch.setitem(sys.modules, "irlcli.envs.bullet.engine", None)
+    done = irl("evaluate", "--idle", "--env", "reacher", "--ood", "gravity=2x", "--store", tmp_path)
+    assert done.code == 1 and done.out == ""
+    assert "reacher needs PyBullet, which is not installed" in done.err
+    assert "hint: use Python 3.11" in done.err and "--env mujoco-ant" in done.err

@@ -29,15 +29,15 @@ def is_finite(array: np.ndarray) -> bool:
     return math.isfinite(array.dot(array))
 
 
-def clipped(action: np.ndarray, shape: tuple[int, ...], bound: float = 1.0) -> np.ndarray:
-    """``action`` as float64, clipped to the actuators' range [-bound, bound].
+def clipped(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """``action`` as float64, clipped to the actuators' range from ``low`` to ``high`` [A] float64.
 
     Raises:
-        ValueError: ``action`` does not have ``shape``, or is not finite.
+        ValueError: ``action`` does not have the bounds' shape, or is not finite.
     """
     action = np.asarray(action, dtype=np.float64)
-    if action.shape != shape:
-        raise ValueError(f"action must have shape {shape}, not {action.shape}")
+    if action.shape != low.shape:
+        raise ValueError(f"action must have shape {low.shape}, not {action.shape}")
     if not is_finite(action):
         raise ValueError(f"action must be finite, not {action.tolist()}")
-    return np.minimum(np.maximum(action, -bound), bound)
+    return np.minimum(np.maximum(action, low), high)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -83,10 +82,7 @@ def build(
     if render_mode is not None:
         arguments = arguments | {"render_mode": render_mode}
     if spec.own is None:
-        if spec.needs is not None and find_spec(spec.needs.module) is None:
-            raise StageFailed(
-                f"{spec.name} needs {spec.needs.name}, which is not installed", spec.needs.hint
-            )
+        _require(spec)
         # Environments that were added since this module was imported.
         register()
         return gymnasium.make(spec.gym_id, **arguments).unwrapped
@@ -99,6 +95,28 @@ def build(
             f'write actions = "{found}" in [env], or omit it',
         )
     return world
+
+
+def _require(spec: EnvironmentSpec) -> None:
+    """Import the library that ``spec`` needs.
+
+    Raises:
+        StageFailed: it is missing or broken.
+    """
+    if spec.needs is None:
+        return
+    try:
+        import_module(spec.needs.module)
+    except ModuleNotFoundError:
+        raise StageFailed(
+            f"{spec.name} needs {spec.needs.name}, which is not installed", spec.needs.hint
+        ) from None
+    except Exception as error:
+        # With MUJOCO_GL=osmesa, MuJoCo raises an AttributeError where OSMesa is missing.
+        raise StageFailed(
+            f"{spec.name} needs {spec.needs.name}, which cannot be imported: {_line(error)}",
+            "check its installation and its environment variables; --debug shows where it fails",
+        ) from error
 
 
 def observed_of(spec: EnvironmentSpec) -> tuple[int | None, bool]:

@@ -73,7 +73,7 @@ class Needs(NamedTuple):
     """A library that an environment needs and that may be missing.
 
     Attributes:
-        module: the name under which it is imported.
+        module: what imports it.
         name: its own name.
         hint: how to install it, or what works instead.
     """

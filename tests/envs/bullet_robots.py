@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pybullet
+import pytest
 
-from irlcli.envs.ant.env import Ant
-from irlcli.envs.half_cheetah.env import HalfCheetah
-from irlcli.envs.reacher.env import Reacher
+pybullet = pytest.importorskip("pybullet", reason="PyBullet has no wheels for this Python")
+
+from irlcli.envs.ant.env import Ant  # noqa: E402
+from irlcli.envs.half_cheetah.env import HalfCheetah  # noqa: E402
+from irlcli.envs.reacher.env import Reacher  # noqa: E402
 
 ROBOTS = {"ant": Ant, "half_cheetah": HalfCheetah, "reacher": Reacher}
 

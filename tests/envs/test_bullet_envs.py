@@ -9,9 +9,8 @@ import warnings
 
 import gymnasium
 import numpy as np
-import pybullet
 import pytest
-from bullet_robots import ROBOTS, body
+from bullet_robots import ROBOTS, body, pybullet
 from gymnasium.utils.env_checker import check_env
 
 from irlcli.envs.ant.env import Ant

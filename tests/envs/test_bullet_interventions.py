@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pybullet
 import pytest
-from bullet_robots import ROBOTS, body, total_mass
+from bullet_robots import ROBOTS, body, pybullet, total_mass
 
 from irlcli.envs.ant.env import Ant
 from irlcli.envs.bullet.world import GRAVITY

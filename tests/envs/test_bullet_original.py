@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pybullet
 import pytest
-from bullet_robots import ROBOTS, body, replay, total_mass, trace
+from bullet_robots import ROBOTS, body, pybullet, replay, total_mass, trace
 
 from irlcli.envs.bullet.world import TIME_STEP
 

@@ -134,6 +134,17 @@ def test_actions_are_clipped_to_the_motors_range(name):
     assert ends[0][1] == ends[1][1]
 
 
+def test_single_precision_actions_have_the_effect_of_double_ones():
+    """Worker processes receive float64, and must lead to the same bytes."""
+    env = ROBOTS["HalfCheetah"]()
+    ends = []
+    for dtype in (np.float32, np.float64):
+        env.reset(seed=0)
+        ends.append(env.step(actions(env, 1)[0].astype(np.float32).astype(dtype)))
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    assert ends[0][1] == ends[1][1]
+
+
 @pytest.mark.parametrize("action", [np.full(6, np.nan), np.full(6, np.inf), np.zeros(5)])
 def test_invalid_actions_are_rejected(action):
     env = ROBOTS["HalfCheetah"]()

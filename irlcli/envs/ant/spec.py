@@ -1,6 +1,6 @@
 """Ant: interventions and time limit (paper Table 2)."""
 
-from irlcli.envs.bullet.knobs import WALKER_KNOBS
+from irlcli.envs.bullet.knobs import PYBULLET, WALKER_KNOBS
 from irlcli.envs.spec import EnvironmentSpec, Knob
 
 SPEC = EnvironmentSpec(
@@ -12,5 +12,6 @@ SPEC = EnvironmentSpec(
         **WALKER_KNOBS,
         "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
     },
+    needs=PYBULLET,
     unobserved="the positions of its parts one substep ago",
 )

@@ -49,6 +49,7 @@ class RobotEnv(gymnasium.Env, abc.ABC):
             self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (observations,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, self.torques.shape, np.float32)
+        self._low, self._high = -np.ones(self.torques.shape), np.ones(self.torques.shape)
 
     @abc.abstractmethod
     def _place(self, positions: np.ndarray) -> Robot:
@@ -91,7 +92,7 @@ class RobotEnv(gymnasium.Env, abc.ABC):
         Raises:
             ValueError: an action of a wrong shape, or not finite.
         """
-        action = clipped(action, self.torques.shape)
+        action = clipped(action, self._low, self._high)
         self._robot.drive(self.torques * action)
         self._world.step()
         observation, potential = self._observe()

@@ -1,6 +1,12 @@
-"""The interventions that Ant and HalfCheetah share (paper Table 2)."""
+"""The interventions that Ant and HalfCheetah share (paper Table 2), and the library they need."""
 
-from irlcli.envs.spec import Knob
+from irlcli.envs.spec import Knob, Needs
+
+PYBULLET = Needs(
+    "irlcli.envs.bullet.engine",
+    "PyBullet",
+    "use Python 3.11, for which it has wheels, or a MuJoCo robot, such as --env mujoco-ant",
+)
 
 WALKER_KNOBS = {
     "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "mass of every link"),

@@ -1,6 +1,6 @@
 """HalfCheetah: interventions and time limit (paper Table 2)."""
 
-from irlcli.envs.bullet.knobs import WALKER_KNOBS
+from irlcli.envs.bullet.knobs import PYBULLET, WALKER_KNOBS
 from irlcli.envs.spec import Cue, EnvironmentSpec, Knob, cue_knob
 
 SPEC = EnvironmentSpec(
@@ -16,5 +16,6 @@ SPEC = EnvironmentSpec(
         # On the way to the goal: the last step went forward, at half a metre per second or more.
         "cue-strength": cue_knob(Cue("friction=1.5:0.1:0.1", window=1, bar=0.5)),
     },
+    needs=PYBULLET,
     unobserved="the position of its torso one substep ago",
 )

@@ -71,8 +71,8 @@ class Robot(MujocoEnv, EzPickle):
         self.observation_space = Box(-np.inf, np.inf, size, np.float32)
         self._warnings = self.data.warning.number[_FIRST : _LAST + 1]
         assert isinstance(self.action_space, Box)
-        self._shape = self.action_space.shape
-        self._bound = float(self.action_space.high[0])
+        self._low = self.action_space.low.astype(np.float64)
+        self._high = self.action_space.high.astype(np.float64)
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         model, self._rise = intervened(self.fullpath, self.legs, self._changes)
@@ -113,7 +113,7 @@ class Robot(MujocoEnv, EzPickle):
         Raises:
             ValueError: an action of a wrong shape, or not finite.
         """
-        action = clipped(action, self._shape, self._bound)
+        action = clipped(action, self._low, self._high)
         state, reward, terminated, _, info = super().step(action)
         observation = state.astype(np.float32)
         # MuJoCo itself starts again from the initial state then.

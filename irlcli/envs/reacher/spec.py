@@ -1,5 +1,6 @@
 """Reacher: intervention and time limit (paper Table 2)."""
 
+from irlcli.envs.bullet.knobs import PYBULLET
 from irlcli.envs.spec import EnvironmentSpec, Knob
 
 SPEC = EnvironmentSpec(
@@ -9,5 +10,6 @@ SPEC = EnvironmentSpec(
     max_episode_steps=150,
     knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "multiple of 9.8 m/s^2")},
     physics=2,
+    needs=PYBULLET,
     transition_reward="irlcli.envs.reacher.env:transition_reward",
 )

@@ -1,10 +1,11 @@
-"""Instructions that one step of each PyBullet environment executes, counted by callgrind.
+"""Instructions that one step of each robot executes, counted by callgrind.
 
-    python benchmarks/bullet_step.py [ant half-cheetah reacher ant-original ...]
+    python benchmarks/robot_step.py [ant half-cheetah-original mujoco-Ant mujoco-Ant-gymnasium ...]
 
 Counts are the difference of two run lengths, so start-up, reset and imports cancel, and they
 do not depend on what else the machine is doing. Needs ``valgrind`` on the path. Actions are
-uniform in the whole range, the same for every run.
+uniform in the whole range, the same for every run. A name that ends in ``-original`` is PyBullet's
+original model, one that ends in ``-gymnasium`` Gymnasium's own MuJoCo environment.
 """
 
 from __future__ import annotations
@@ -18,11 +19,26 @@ import tempfile
 import numpy as np
 
 SHORT, LONG = 200, 500
-WORLDS = ("ant", "half-cheetah", "reacher")
+MUJOCO = ("Ant", "HalfCheetah", "Hopper", "Walker2d", "Humanoid")
+WORLDS = (
+    "ant",
+    "half-cheetah",
+    "reacher",
+    *(f"mujoco-{name}{of}" for name in MUJOCO for of in ("", "-gymnasium")),
+)
 
 
 def make(name: str):
-    """The environment called ``name``, the original model if it ends in ``-original``."""
+    """The environment called ``name``."""
+    kind, _, of = name.removeprefix("mujoco-").partition("-")
+    if name.startswith("mujoco-"):
+        if of == "gymnasium":
+            import gymnasium
+
+            return gymnasium.make(f"{kind}-v5").unwrapped
+        from irlcli.envs.mujoco import env
+
+        return getattr(env, kind)()
     from irlcli.envs.ant.env import Ant
     from irlcli.envs.half_cheetah.env import HalfCheetah
     from irlcli.envs.reacher.env import Reacher
@@ -37,7 +53,8 @@ def roll_out(name: str, steps: int) -> None:
     env = make(name)
     env.reset(seed=0)
     random = np.random.default_rng(0)
-    for action in random.uniform(-1.0, 1.0, (LONG, *env.action_space.shape))[:steps]:
+    bound = env.action_space.high[0]
+    for action in random.uniform(-bound, bound, (LONG, *env.action_space.shape))[:steps]:
         env.step(action)
     env.close()
 
