@@ -13,8 +13,8 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from mujoco_robots import HalfCheetah
 
-from irlcli.envs.half_cheetah.env import HalfCheetah
 from irlcli.envs.vector import VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
 
