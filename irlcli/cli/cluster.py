@@ -13,7 +13,7 @@ from irlcli.cli.session import Session, StageSession
 from irlcli.errors import StageFailed, UsageError, suggest
 
 if TYPE_CHECKING:
-    from irlcli.experiments.cluster.submission import Queue
+    from irlcli.experiments.cluster.queue import Queue
     from irlcli.experiments.execute import Outcome
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.runner import Runner
@@ -141,8 +141,8 @@ def ended_submissions(session: Session, grace_seconds: float) -> list[Path]:
 
 def print_status(session: StageSession, found: "Plan", options: ClusterOptions) -> None:
     """A line for each step that does not exist: its job, or why there is none."""
+    from irlcli.experiments.cluster.queue import queued
     from irlcli.experiments.cluster.records import records
-    from irlcli.experiments.cluster.submission import queued
 
     queue = open_queue(session, options)
     there = queued(found, queue, session.store)
@@ -175,7 +175,7 @@ def print_status(session: StageSession, found: "Plan", options: ClusterOptions) 
 
 def cancel(session: StageSession, found: "Plan", options: ClusterOptions) -> None:
     """Cancel the jobs of a table; those that run write a checkpoint first."""
-    from irlcli.experiments.cluster.submission import queued
+    from irlcli.experiments.cluster.queue import queued
 
     queue = open_queue(session, options)
     there = queued(found, queue, session.store)

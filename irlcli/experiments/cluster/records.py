@@ -146,8 +146,11 @@ def ended(
 
 
 def _changed(path: Path) -> float:
-    """When the directory ``path``, or a file in it, was last changed [s since 1970]."""
-    return max((p.stat().st_mtime for p in path.rglob("*")), default=path.stat().st_mtime)
+    """When ``path``, or a file below it, was last changed [s since 1970]; now if it disappears."""
+    try:
+        return max(p.stat().st_mtime for p in (path, *path.rglob("*")))
+    except FileNotFoundError:
+        return time.time()
 
 
 def remove(found: Iterable[Path]) -> None:

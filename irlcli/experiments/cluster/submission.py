@@ -1,20 +1,20 @@
-"""The missing steps of a plan as jobs: submitted, watched, and looked up again later."""
+"""The missing steps of a plan as jobs: submitted, and watched."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from irlcli.errors import StageFailed
 from irlcli.experiments.cluster.arrays import Array, job_arrays
 from irlcli.experiments.cluster.job import StepJob
+from irlcli.experiments.cluster.queue import Queue, queued
 from irlcli.experiments.cluster.records import (
     LOCK,
     Record,
     Submitted,
     ended,
     new_record,
-    records,
     remove,
 )
 from irlcli.experiments.execute import Display, Outcome
@@ -23,41 +23,10 @@ from irlcli.experiments.plan import Plan
 from irlcli.experiments.runner import Runner
 from irlcli.experiments.signals import stop_requests
 from irlcli.stages import choose_penalty
-from irlcli.store import Store
 
 _LONGEST_PAUSE = 20.0
 # A controller that restarts, or is too busy to answer, comes back.
 _SILENCE_SECONDS = 600.0
-
-
-class Queue(Protocol):
-    """A place that runs jobs.
-
-    Attributes:
-        name: as ``--cluster`` takes it.
-        place: tells it from other queues whose jobs the same store records.
-        starts_what_waits: whether it starts a job by itself when those before it have ended.
-        lag: how long after the end of a job its files may be invisible here [s].
-    """
-
-    name: str
-    starts_what_waits: bool
-    lag: float
-
-    @property
-    def place(self) -> str: ...
-
-    def submit(
-        self, jobs: Sequence[StepJob], logs: Path, after: Sequence[str], matching: str | None
-    ) -> list[str]: ...
-
-    def states(self) -> dict[str, str]: ...
-
-    def cancel(self, ids: Iterable[str]) -> None: ...
-
-    def probe(
-        self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]
-    ) -> None: ...
 
 
 class JobCommand(NamedTuple):
@@ -74,36 +43,6 @@ class JobCommand(NamedTuple):
     directory: Path
     requeues: int
     at_a_time: int
-
-
-class Queued(NamedTuple):
-    """A job in the queue: its id, its state, and the record that holds its logs."""
-
-    job: str
-    state: str
-    record: Record
-
-
-def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
-    """The plan's steps that are in the queue, whoever submitted them, by name."""
-    states = queue.states()
-    by_identity: dict[str, Queued] = {}
-    by_name: dict[str, Queued] = {}
-    for record in records(store, queue.place):
-        for name, identity, job in record.jobs:
-            if job in states:
-                by_identity[identity] = by_name[name] = Queued(job, states[job], record)
-    found = {}
-    changing: set[str] = set()
-    for name, task in plan.tasks.items():
-        there = by_identity.get(plan.identities[name])
-        if task.request.stage == choose_penalty.STAGE or not changing.isdisjoint(plan.needs[name]):
-            # Once a lambda is chosen, the reward is another request under the same name.
-            changing.add(name)
-            there = there or by_name.get(name)
-        if there is not None:
-            found[name] = there
-    return found
 
 
 class Submission:

@@ -1,0 +1,71 @@
+"""A place that runs jobs, and which steps of a plan are in it."""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from irlcli.experiments.cluster.job import StepJob
+from irlcli.experiments.cluster.records import Record, records
+from irlcli.experiments.plan import Plan
+from irlcli.stages import choose_penalty
+from irlcli.store import Store
+
+
+class Queue(Protocol):
+    """A place that runs jobs.
+
+    Attributes:
+        name: as ``--cluster`` takes it.
+        place: tells it from other queues whose jobs the same store records.
+        starts_what_waits: whether it starts a job by itself when those before it have ended.
+        lag: how long after the end of a job its files may be invisible here [s].
+    """
+
+    name: str
+    starts_what_waits: bool
+    lag: float
+
+    @property
+    def place(self) -> str: ...
+
+    def submit(
+        self, jobs: Sequence[StepJob], logs: Path, after: Sequence[str], matching: str | None
+    ) -> list[str]: ...
+
+    def states(self) -> dict[str, str]: ...
+
+    def cancel(self, ids: Iterable[str]) -> None: ...
+
+    def probe(
+        self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]
+    ) -> None: ...
+
+
+class Queued(NamedTuple):
+    """A job in the queue: its id, its state, and the record that holds its logs."""
+
+    job: str
+    state: str
+    record: Record
+
+
+def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
+    """The plan's steps that are in the queue, whoever submitted them, by name."""
+    states = queue.states()
+    by_identity: dict[str, Queued] = {}
+    by_name: dict[str, Queued] = {}
+    for record in records(store, queue.place):
+        for name, identity, job in record.jobs:
+            if job in states:
+                by_identity[identity] = by_name[name] = Queued(job, states[job], record)
+    found = {}
+    changing: set[str] = set()
+    for name, task in plan.tasks.items():
+        there = by_identity.get(plan.identities[name])
+        if task.request.stage == choose_penalty.STAGE or not changing.isdisjoint(plan.needs[name]):
+            # Once a lambda is chosen, the reward is another request under the same name.
+            changing.add(name)
+            there = there or by_name.get(name)
+        if there is not None:
+            found[name] = there
+    return found
