@@ -44,6 +44,7 @@ def test_the_shipped_tables_are_the_papers():
         "control-airl-5",
         "table1-5",
         "demo",
+        "mujoco",
         "experts",
         "control",
     }
@@ -60,6 +61,8 @@ def test_the_shipped_tables_are_the_papers():
         assert tables[name].methods == ("erm", "irm", "erm-balanced", "irm-shuffled")
         assert tables[name].seeds == (0, 1, 2, 3, 4)
     assert tables["table1"].measures == ("transfer", "from-student", "zero-shot", "id")
+    assert tables["mujoco"].methods == tables["table1"].methods
+    assert tables["mujoco"].seeds == (0, 1, 2) and len(rows["mujoco"]) == 5
     assert (tables["demo"].methods, tables["demo"].seeds) == (("erm", "irm"), (0,))
     assert tables["demo"].settings.name == "lunar-lander.toml"
 
