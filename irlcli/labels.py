@@ -86,6 +86,7 @@ def learned(config: Mapping[str, Any]) -> str:
             f"dropping {_number(dropout)}" if dropout else None,
             f"selected by {select}" if select != "last" else None,
             "from a clone" if config.get("bc_epochs") else None,
+            f"mean of {rounds} rounds" if (rounds := config.get("averaged_rounds")) else None,
             "with challengers" if isinstance(challenger, dict) and challenger.get("life") else None,
         ]
     )

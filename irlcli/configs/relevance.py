@@ -101,6 +101,14 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         airl = replace(airl, dropout=UNSET)
     if not airl.columns:
         airl = replace(airl, columns=UNSET)
+    if airl.averaged_rounds in (UNSET, 1):
+        airl = replace(airl, averaged_rounds=UNSET)
+    elif airl.select != "last":
+        raise UsageError(
+            f"airl.averaged_rounds = {airl.averaged_rounds} cannot be combined with airl.select = "
+            f"{airl.select}: a mean of rounds has no best round",
+            "--set airl.select=last, or omit airl.averaged_rounds",
+        )
     if airl.grouping == "pooled":
         airl = replace(airl, pairing=_AIRL.pairing)
     if airl.logit == "f":

@@ -23,6 +23,7 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]
 Dropout = Annotated[float, Meta(ge=0, lt=1)]
 Quantile = Annotated[float, Meta(ge=0, le=1, description="a quantile")]
 Columns = Annotated[tuple[Annotated[int, Meta(ge=-4096, le=4095)], ...], Meta(max_length=4096)]
+Members = Annotated[int, Meta(ge=1, le=1000)]
 # gamma = 1 would make the value of an absorbing state infinite.
 Discount = Annotated[float, Meta(ge=0, lt=1)]
 # Bounded, so that no description can ask for a network that does not fit memory.
@@ -207,6 +208,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             is none. The field is younger than the keys of many rewards, and unset it is in no key.
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Unset (or empty) is all, and in no key.
+        averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
+            equally spaced up to the last. Unset (or 1) is the last g alone, and in no key.
         select: the round that is kept: ``last``, the best on held-out ``episodes``, or the best in
             one setting (``leg-length=1x``), which is left out of training. Scored every
             ``select_every`` rounds, a setting over ``select_episodes``.
@@ -248,6 +251,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ppo: PPOConfig = PPOConfig()
     dropout: Dropout | UnsetType = UNSET
     columns: Columns | UnsetType = UNSET
+    averaged_rounds: Members | UnsetType = UNSET
 
 
 class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

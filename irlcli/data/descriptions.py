@@ -17,6 +17,7 @@ from irlcli.configs.schema import (
     Finite,
     GridworldConfig,
     MaxEntConfig,
+    Members,
     Positive,
     Quantile,
     Widths,
@@ -38,7 +39,7 @@ Quantiles = Annotated[tuple[Finite, ...], Meta(min_length=101, max_length=101)]
 class RewardNetwork(
     Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True
 ):
-    """Arguments of :class:`irlcli.learners.reward_model.RewardModel`."""
+    """Arguments of :func:`irlcli.learners.reward_model.build`."""
 
     observation_size: Size
     action_size: Size
@@ -50,6 +51,7 @@ class RewardNetwork(
     shaping: bool
     columns: Columns = ()
     choices: Annotated[tuple[Size, ...], Meta(max_length=4096)] = ()
+    members: Members = 1
 
 
 class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -50,11 +50,11 @@ def write_policy(
 def write_reward(directory: Path, learner: Any, **origin: Any) -> None:
     """Write ``reward.pt`` and its description ``reward.json``, which is readable without torch.
 
-    ``learner`` has ``network``, ``scale``, ``quantiles`` and ``model``; ``origin`` holds the other
+    ``learner`` has ``network``, ``scale``, ``quantiles`` and ``deployed``; ``origin`` holds the other
     fields of :class:`descriptions.Reward`.
     """
     description = descriptions.Reward(
         network=learner.network, scale=learner.scale, quantiles=learner.quantiles, **origin
     )
-    tensors.save(directory / "reward.pt", "reward", description, learner.model.state_dict())
+    tensors.save(directory / "reward.pt", "reward", description, learner.deployed.state_dict())
     write_json(directory / "reward.json", msgspec.to_builtins(description))

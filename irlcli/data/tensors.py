@@ -27,7 +27,7 @@ from msgspec import Struct
 from irlcli.data import descriptions
 from irlcli.errors import IntegrityError, NewerFormat, UsageError
 from irlcli.interventions import parse_setting
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import RewardModule, build
 from irlcli.rl.policy import Policy, load_policy
 
 SCHEMA = 1
@@ -199,8 +199,8 @@ def load_policy_file(path: Path) -> tuple[Policy, descriptions.Policy]:
     return policy, description
 
 
-def load_reward_file(path: Path) -> tuple[RewardModel, descriptions.Reward]:
-    """A reward model, frozen, and its description.
+def load_reward_file(path: Path) -> tuple[RewardModule, descriptions.Reward]:
+    """A reward model or the mean of several, frozen, and its description.
 
     Raises:
         UsageError, IntegrityError: as :func:`load`; also tensors that do not fit the description
@@ -208,7 +208,7 @@ def load_reward_file(path: Path) -> tuple[RewardModel, descriptions.Reward]:
     """
     description, state = load(path, "reward")
     try:
-        model = RewardModel(**msgspec.structs.asdict(description.network))
+        model = build(**msgspec.structs.asdict(description.network))
         model.load_state_dict(state)
     except _MISFIT as error:
         raise _misfit(path, error) from None

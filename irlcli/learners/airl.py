@@ -22,11 +22,11 @@ the horizon would show it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import torch
-from msgspec.structs import asdict
 
 from irlcli.configs.schema import AIRLConfig
 from irlcli.data.descriptions import RewardNetwork
@@ -57,7 +57,7 @@ from irlcli.learners.pools import (
     sample_minibatch,
 )
 from irlcli.learners.replay import Replay, whole_episodes
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import AveragedReward, RewardModel, RewardModule
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
 from irlcli.penalties.risk import cross_entropy
 from irlcli.seeds import derive
@@ -124,20 +124,25 @@ class AIRL:
         counts = [len(episodes) for episodes in demonstrations]
         self._groups = group(config.grouping, counts, rng)
         self._weights = torch.tensor([g.weight for g in self._groups])
-        self.network = RewardNetwork(
-            observation_size=observation_size,
-            action_size=actions.size,
-            discrete=actions.discrete,
-            state_only=config.state_only,
-            hidden=config.hidden,
-            activation=config.activation,
-            gamma=config.ppo.gamma,
-            shaping=config.shaping,
-            columns=config.columns or (),
-            choices=actions.choices,
-        )
+        shape: dict[str, Any] = {
+            "observation_size": observation_size,
+            "action_size": actions.size,
+            "discrete": actions.discrete,
+            "state_only": config.state_only,
+            "hidden": config.hidden,
+            "activation": config.activation,
+            "gamma": config.ppo.gamma,
+            "shaping": config.shaping,
+            "columns": config.columns or (),
+            "choices": actions.choices,
+        }
+        members = config.averaged_rounds or 1
+        self.network = RewardNetwork(**shape, members=members)
         torch.manual_seed(derive("discriminator", seed, -1)[0])
-        self.model = RewardModel(**asdict(self.network), dropout=config.dropout or 0.0).eval()
+        self.model = RewardModel(**shape, dropout=config.dropout or 0.0).eval()
+        # The rounds after which g joins the mean that is frozen; see AveragedReward.
+        self._joins = {rounds * k // members - 1 for k in range(1, members + 1)}
+        self._members: list[RewardModel] = []
         # Decoupled, so that dividing the loss by lambda does not make the decay lambda times
         # stronger.
         self._optimizer = torch.optim.AdamW(
@@ -154,7 +159,7 @@ class AIRL:
             config.challenger.replay_episodes_per_round,
             config.challenger.replay_capacity,
         )
-        # Standard deviation of g on the last round's samples.
+        # Standard deviation of the deployed g on the last round's samples.
         self.scale = 1.0
         for episodes in self._demonstrations:
             self.model.normaliser.update(torch.as_tensor(join(episodes).observations))
@@ -191,7 +196,7 @@ class AIRL:
         reward = bounded_pay(
             self.model,
             data,
-            level_of(self.quantiles, self.config.challenger.ceiling),
+            level_of(self._quantiles_of(self.model), self.config.challenger.ceiling),
             self.config.fixed_horizon,
             self.config.challenger.ppo.gamma,
         )
@@ -257,7 +262,9 @@ class AIRL:
             for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
                 for setting, (data, numbers) in enumerate(found):
                     replay.add(setting, data, numbers, rng)
-        self.scale = reward_scale(self.model, [*current, *expert])
+        if index in self._joins and self.network.members > 1:
+            self._members.append(deepcopy(self.model).requires_grad_(False))
+        self.scale = reward_scale(self.deployed, [*current, *expert])
         optimised_cross_entropy, optimised_penalty = np.mean(losses, 0)
         return [
             diagnostics
@@ -398,10 +405,18 @@ class AIRL:
         )
 
     @property
+    def deployed(self) -> RewardModule:
+        """What is frozen: the current reward, or the mean of those that have joined it so far."""
+        return AveragedReward(self._members) if self._members else self.model
+
+    @property
     def quantiles(self) -> tuple[float, ...]:
-        """Of g on the demonstrations, see :func:`reward_quantiles`."""
+        """Of the deployed g on the demonstrations, see :func:`reward_quantiles`."""
+        return self._quantiles_of(self.deployed)
+
+    def _quantiles_of(self, model: RewardModule) -> tuple[float, ...]:
         pools = [self._pool(join(episodes), None) for episodes in self._demonstrations]
-        return reward_quantiles(self.model, pools)
+        return reward_quantiles(model, pools)
 
     # Checkpoints and snapshots
 
@@ -413,6 +428,7 @@ class AIRL:
             "scale": self.scale,
             "replay": self._replay.state_dict(),
             "challenger_replay": self._challenger_replay.state_dict(),
+            "members": [member.state_dict() for member in self._members],
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -422,6 +438,11 @@ class AIRL:
         self.scale = state["scale"]
         self._replay.load_state_dict(state["replay"])
         self._challenger_replay.load_state_dict(state["challenger_replay"])
+        self._members = []
+        for tensors in state["members"]:
+            member = deepcopy(self.model).requires_grad_(False)
+            member.load_state_dict(tensors)
+            self._members.append(member)
 
     def snapshot(self) -> dict[str, Any]:
         """A copy of the reward as it is now."""

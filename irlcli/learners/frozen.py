@@ -12,7 +12,7 @@ from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
 from irlcli.learners.actions import ActionView, Policy
 from irlcli.learners.pay import bounded_pay, episode_reward, level_of
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import RewardModule
 from irlcli.learners.standalone import StandaloneReward
 from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
 
@@ -38,7 +38,7 @@ class FrozenReward:
 
     def __init__(
         self,
-        model: RewardModel,
+        model: RewardModule,
         origin: Reward,
         horizon: int,
         gamma: float,

@@ -10,7 +10,7 @@ import torch
 from torch.nn.functional import softplus
 
 from irlcli.learners.pools import Pool, make_pool
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import RewardModel, RewardModule
 from irlcli.trajectories import Transitions
 
 
@@ -67,7 +67,7 @@ def imitation_reward(
 
 
 def bounded_pay(
-    model: RewardModel, data: Transitions, ceiling: float, absorbing: bool, gamma: float
+    model: RewardModule, data: Transitions, ceiling: float, absorbing: bool, gamma: float
 ) -> torch.Tensor:
     """min(g, ``ceiling``) of each transition [B] float32, without gradient.
 
@@ -79,12 +79,13 @@ def bounded_pay(
         pay = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
         terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
         if absorbing and bool(terminated.any()):
-            g, _ = model.absorbing_reward(torch.as_tensor(data.next_observations))
+            final = torch.as_tensor(data.next_observations)
+            g = model.reward(final, torch.zeros(len(final), model.action_size))
             pay = pay + terminated * gamma / (1.0 - gamma) * g.clamp(max=ceiling)
         return pay
 
 
-def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
+def reward_scale(model: RewardModule, pools: Sequence[Pool]) -> float:
     """Standard deviation of g over the samples of ``pools``, each row as often as drawn.
 
     Fixed on training data, it makes frozen rewards of different runs comparable. Nothing is
@@ -95,7 +96,7 @@ def reward_scale(model: RewardModel, pools: Sequence[Pool]) -> float:
     return max(float(g.double().std()), 1e-6)
 
 
-def reward_quantiles(model: RewardModel, demonstrations: Sequence[Pool]) -> tuple[float, ...]:
+def reward_quantiles(model: RewardModule, demonstrations: Sequence[Pool]) -> tuple[float, ...]:
     """The 0, 1, ... 100 % quantiles of g over the settings' pools of ``demonstrations``.
 
     Each row counts as often as drawn; all settings weigh the same.
@@ -118,7 +119,7 @@ def level_of(quantiles: Sequence[float], share: float) -> float:
 
 
 def episode_reward(
-    model: RewardModel, data: Transitions, absorbing: bool, ceiling: float = math.inf
+    model: RewardModule, data: Transitions, absorbing: bool, ceiling: float = math.inf
 ) -> float:
     """Undiscounted sum of min(g, ``ceiling``) over ``data``; with ``absorbing``, up to the horizon."""
     with torch.no_grad():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import RewardModule
 from irlcli.trajectories import Transitions
 
 
@@ -30,7 +30,7 @@ class Pool:
 
 
 def make_pool(
-    model: RewardModel, data: Transitions, log_probs: torch.Tensor, absorbing: bool
+    model: RewardModule, data: Transitions, log_probs: torch.Tensor, absorbing: bool
 ) -> Pool:
     """The pool of ``data`` with log pi(a|s) = ``log_probs`` [B] of its transitions.
 

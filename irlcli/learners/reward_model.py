@@ -7,6 +7,7 @@ potential h(s) (paper Eq. 2; Fu et al. 2017). Only g leaves adversarial training
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -50,6 +51,7 @@ class RewardModel(nn.Module):
         choices: Sequence[int] = (),
     ):
         super().__init__()
+        self.observation_size = observation_size
         self.action_size = action_size
         self.discrete = discrete
         self.state_only = state_only
@@ -123,3 +125,52 @@ class RewardModel(nn.Module):
             return g, g
         h = self.h(self._seen(observations))[..., 0]
         return g, g + (self.gamma - 1.0) * h
+
+
+class AveragedReward(nn.Module):
+    """The mean of g of several reward models: what is frozen if ``airl.averaged_rounds`` says so.
+
+    A policy trained on the last g alone may find what no policy in training was paid for at that
+    moment. The mean remembers what every round corrected (the average iterate of a zero-sum game;
+    TRIRL, arXiv 2605.11020, averages rewards too). Each member normalises observations by the
+    moments of its own round.
+
+    Args:
+        members: at least one, of the same shape.
+    """
+
+    def __init__(self, members: Sequence[RewardModel]):
+        super().__init__()
+        self.members = nn.ModuleList(members)
+        self.observation_size = members[0].observation_size
+        self.action_size = members[0].action_size
+        self.discrete = members[0].discrete
+        self.choices, self.several = members[0].choices, members[0].several
+
+    def encode(self, actions: torch.Tensor) -> torch.Tensor:
+        """As :meth:`RewardModel.encode`."""
+        return self._first.encode(actions)
+
+    def indices(self, actions: torch.Tensor) -> list[tuple[torch.Tensor, int]]:
+        """As :meth:`RewardModel.indices`."""
+        return self._first.indices(actions)
+
+    def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
+        """The mean of g [B] for observations [B, D] and encoded actions [B, A]."""
+        found = [member.reward(observations, action_vectors) for member in self.members]
+        return torch.stack(found).mean(0)
+
+    @property
+    def _first(self) -> RewardModel:
+        return cast(RewardModel, self.members[0])
+
+
+# What is frozen.
+RewardModule = RewardModel | AveragedReward
+
+
+def build(members: int = 1, **shape: Any) -> RewardModule:
+    """An untrained reward model of ``shape``, or the mean of several."""
+    if members == 1:
+        return RewardModel(**shape)
+    return AveragedReward([RewardModel(**shape) for _ in range(members)])

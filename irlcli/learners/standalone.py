@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import RewardModule
 
 
 class StandaloneReward(nn.Module):
@@ -25,7 +25,7 @@ class StandaloneReward(nn.Module):
 
     def __init__(
         self,
-        model: RewardModel,
+        model: RewardModule,
         scale: float,
         absorbing: bool,
         gamma: float,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from irlcli.data.descriptions import Reward
-    from irlcli.learners.reward_model import RewardModel
+    from irlcli.learners.reward_model import RewardModule
     from irlcli.trajectories import Trajectory
 
 
@@ -166,7 +166,7 @@ def _episodes(job: Job, entry: Entry) -> Sequence[Trajectory]:
 
 def _epic_distances(
     where: EnvironmentKey,
-    model: RewardModel,
+    model: RewardModule,
     origin: Reward,
     episodes: Mapping[Entry, Sequence[Trajectory]],
 ) -> tuple[dict[str, float | None], str]:

@@ -21,7 +21,7 @@ from irlcli.store import Artefact
 if TYPE_CHECKING:
     from irlcli.data.descriptions import Reward
     from irlcli.learners.frozen import FrozenReward
-    from irlcli.learners.reward_model import RewardModel
+    from irlcli.learners.reward_model import RewardModule
     from irlcli.rl.loop import Row, Training
     from irlcli.trajectories import Trajectory
 
@@ -231,7 +231,7 @@ def run_parts(
 def frozen_reward(
     where: EnvironmentKey,
     setting: str,
-    model: RewardModel,
+    model: RewardModule,
     origin: Reward,
     ceiling: float | None = None,
     gamma: float | None = None,

@@ -165,6 +165,12 @@ def run(job: Job) -> None:
         trainer = PPOTrainer(
             worlds, airl.ppo, airl.total_steps, p.seed, STAGE.name, keep_moments=airl.bc_epochs > 0
         )
+        if (airl.averaged_rounds or 1) > trainer.rounds:
+            raise UsageError(
+                f"airl.averaged_rounds = {airl.averaged_rounds}, but training has "
+                f"{trainer.rounds} rounds",
+                f"--set airl.averaged_rounds={trainer.rounds} or less",
+            )
         try:
             learner = learner_class(airl.learner)(
                 episodes,

@@ -23,7 +23,7 @@ def write_reward(path: Path, module: StandaloneReward, about: dict[str, object])
         OSError: the file cannot be written.
     """
     model = module.model
-    size = len(model.normaliser.mean)
+    size = model.observation_size
     # Each of its own: torch takes one tensor in two places for one argument.
     observations, following = torch.zeros(_EXAMPLES, size), torch.zeros(_EXAMPLES, size)
     actions = torch.zeros(_EXAMPLES, model.action_size)
