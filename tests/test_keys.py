@@ -266,8 +266,8 @@ UNREAD = {
     # Of other parts of the control.
     "control-maps": [f"control.maps.{n}" for n in ("settings", "spread", "gaps", "choices")],
 }
-# Challengers need logits without log pi.
-REFUSED = ["airl.ppo.use_sde", "airl.logit"]
+# Challengers need logits without log pi, and a mean of rounds has no best round.
+REFUSED = ["airl.ppo.use_sde", "airl.logit", "airl.averaged_rounds"]
 # Fields whose type does not tell another valid value.
 CHANGED = {
     "expert.bar": 1.0,
@@ -276,6 +276,7 @@ CHANGED = {
     "airl.select": "episodes",
     "airl.dropout": 0.5,
     "airl.columns": (-1,),
+    "airl.averaged_rounds": 3,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
     "transfer.sac.tau": 0.1,
@@ -499,6 +500,12 @@ def test_no_dropout_is_in_no_key():
 def test_all_columns_are_in_no_key():
     none, last = (with_field(in_use(), "airl.columns", columns) for columns in ((), (-1,)))
     assert key(airl(none)) == key(airl(in_use())) != key(airl(last))
+
+
+def test_the_last_round_alone_is_in_no_key():
+    last = with_field(in_use(), "airl.select", "last")
+    one, three = (with_field(last, "airl.averaged_rounds", rounds) for rounds in (1, 3))
+    assert key(airl(one)) == key(airl(last)) != key(airl(three))
 
 
 def test_no_warm_up_is_in_no_key():

@@ -21,7 +21,7 @@ from irlcli.configs import AIRLConfig
 from irlcli.data.descriptions import RewardNetwork
 from irlcli.data.outputs import write_reward
 from irlcli.errors import IrlError
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import build
 
 SPACES = {"half-cheetah": (17, 6, False), "lunar-lander": (8, 4, True)}
 SETTING = {"half-cheetah": "leg-length=0.7", "lunar-lander": "bounce=0.1"}
@@ -45,10 +45,10 @@ def write_random_reward(directory, env, **airl):
     torch.manual_seed(0)
     import msgspec
 
-    model = RewardModel(**msgspec.structs.asdict(network))
+    model = build(**msgspec.structs.asdict(network))
     model.normaliser.update(torch.randn(100, size) * 3 + 1)
     quantiles = tuple(np.linspace(-0.5, 0.5, 101).tolist())
-    learner = SimpleNamespace(network=network, scale=SCALE, quantiles=quantiles, model=model)
+    learner = SimpleNamespace(network=network, scale=SCALE, quantiles=quantiles, deployed=model)
     directory.mkdir(exist_ok=True)
     write_reward(
         directory, learner, airl=config, env=env, settings=(SETTING[env],), method="erm", seed=0

@@ -149,20 +149,20 @@ class AveragedReward(nn.Module):
 
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
         """As :meth:`RewardModel.encode`."""
-        return self._first.encode(actions)
+        return self._models[0].encode(actions)
 
     def indices(self, actions: torch.Tensor) -> list[tuple[torch.Tensor, int]]:
         """As :meth:`RewardModel.indices`."""
-        return self._first.indices(actions)
+        return self._models[0].indices(actions)
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """The mean of g [B] for observations [B, D] and encoded actions [B, A]."""
-        found = [member.reward(observations, action_vectors) for member in self.members]
+        found = [member.reward(observations, action_vectors) for member in self._models]
         return torch.stack(found).mean(0)
 
     @property
-    def _first(self) -> RewardModel:
-        return cast(RewardModel, self.members[0])
+    def _models(self) -> list[RewardModel]:
+        return cast(list[RewardModel], list(self.members))
 
 
 # What is frozen.

@@ -181,7 +181,7 @@ CHALLENGED = [
 ]
 
 
-@pytest.mark.parametrize("changes", [{}, {"bc_epochs": 2}, *CHALLENGED])
+@pytest.mark.parametrize("changes", [{}, {"bc_epochs": 2}, {"averaged_rounds": 3}, *CHALLENGED])
 def test_a_resumed_run_equals_an_uninterrupted_one(demos, changes):
     """To the byte, the replay, a clone and challengers included."""
 

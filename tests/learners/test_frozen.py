@@ -21,7 +21,7 @@ from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
 from irlcli.learners.pay import bounded_pay, reward_quantiles
 from irlcli.learners.pools import make_pool
-from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.reward_model import RewardModel, build
 from irlcli.rl.rollout import roll_out
 from irlcli.trajectories import ActionSpace, Trajectory, Transitions
 
@@ -168,7 +168,7 @@ def continuous(path, actions, numbers=None):
         network=network,
         scale=2.0,
     )
-    model = RewardModel(**asdict(network))
+    model = build(**asdict(network))
     state = {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
     state["normaliser.variance"] += 1.0
     state["g.0.weight"] = torch.tensor(numbers or [[2.0, 3.0]])

@@ -1,13 +1,17 @@
 """What makes a reward retrainable: a slope everywhere, challengers, and a ceiling on their pay."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, make, random_episodes
+from airl_runs import CONFIG, LANDER, make, random_episodes
 from msgspec.structs import replace
 
 from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
 from irlcli.configs.relevance import relevant_airl
+from irlcli.data.outputs import write_reward
+from irlcli.data.tensors import load_reward_file
 from irlcli.errors import UsageError
 from irlcli.learners import airl, discriminator
 from irlcli.learners.pools import Minibatch
@@ -256,3 +260,44 @@ def test_the_number_of_worlds_a_challenger_is_configured_with_does_not_matter():
         for ppo in (PPOConfig(n_envs=n, n_steps=32, batch_size=128) for n in (1, 16))
     ]
     assert found[0] == found[1] and found[0].challenger.ppo.batch_size == 128
+
+
+# The mean of several rounds
+
+
+def test_the_deployed_reward_is_the_mean_over_equally_spaced_rounds(demos, tmp_path):
+    trainer, learner = make(
+        demos, ppo=LONG, horizon=HORIZON, total_steps=6 * 220 * 8, averaged_rounds=3
+    )
+    assert trainer.rounds == 6
+    after = []
+    for index in range(6):
+        (rollout,) = trainer.train_round(index, learner)
+        learner.update(index, [rollout], trainer.policy)
+        after.append(deepcopy(learner.model))
+    states, actions = torch.randn(7, 8) * 3, torch.eye(4)[torch.randint(4, (7,))]
+    expected = sum(after[index].reward(states, actions) for index in (1, 3, 5)) / 3
+    torch.testing.assert_close(learner.deployed.reward(states, actions), expected)
+    # The level that a ceiling refers to is that of the mean, too.
+    shown = torch.as_tensor(np.concatenate([t.observations[:-1] for t in demos[0] + demos[1]]))
+    taken = torch.eye(4)[np.concatenate([t.actions for t in demos[0] + demos[1]])]
+    assert learner.quantiles[-1] >= float(learner.deployed.reward(shown, taken).max()) - 1e-5
+
+    write_reward(
+        tmp_path,
+        learner,
+        env=LANDER,
+        settings=("engine-power=1x",),
+        method="erm",
+        seed=0,
+        airl=learner.config,
+    )
+    model, description = load_reward_file(tmp_path / "reward.pt")
+    assert description.network.members == 3
+    torch.testing.assert_close(model.reward(states, actions), expected)
+
+
+def test_a_mean_has_no_best_round():
+    config = AIRLConfig(averaged_rounds=2, select="episodes")
+    with pytest.raises(UsageError, match="averaged_rounds = 2 cannot be combined"):
+        relevant_airl(config, True)
