@@ -352,17 +352,19 @@ def _field_hint(field: str) -> str:
             return "see settings/ for examples"
         (kind,) = (f.type for f in msgspec.structs.fields(value) if f.name == name)
         value = getattr(value, name)
-    or_none = ", or none" if type(None) in get_args(kind) else ""
-    for member in get_args(kind) if or_none else (kind,):
+    unset = value is msgspec.UNSET
+    otherwise = ", or none" if type(None) in get_args(kind) else ", or omit it" if unset else ""
+    for member in get_args(kind) if otherwise else (kind,):
         if get_origin(member) is Literal:
             return f"one of: {', '.join(get_args(member))}"
         for meta in getattr(member, "__metadata__", ()):
             if meta.ge is not None and meta.le is not None and meta.le < _MANY:
                 bounds = (
-                    f"{meta.description or 'a number'} from {meta.ge:g} to {meta.le:g}{or_none}"
+                    f"{meta.description or 'a number'} from {meta.ge:g} to {meta.le:g}{otherwise}"
                 )
-                return bounds if value is None else f"{bounds}, for example {_shown(value)}"
-    if value is msgspec.UNSET:
+                known = value is not None and not unset
+                return f"{bounds}, for example {_shown(value)}" if known else bounds
+    if unset:
         whole = any(int in get_args(member) for member in get_args(kind))
         return "write a whole number from 0, or omit it" if whole else "write a value, or omit it"
     if value is None:

@@ -23,7 +23,7 @@ Fraction = Annotated[float, Meta(ge=0, le=1)]
 Dropout = Annotated[float, Meta(ge=0, lt=1)]
 Quantile = Annotated[float, Meta(ge=0, le=1, description="a quantile")]
 Columns = Annotated[tuple[Annotated[int, Meta(ge=-4096, le=4095)], ...], Meta(max_length=4096)]
-Members = Annotated[int, Meta(ge=1, le=1000)]
+Members = Annotated[int, Meta(ge=1, le=1000, description="a whole number")]
 # gamma = 1 would make the value of an absorbing state infinite.
 Discount = Annotated[float, Meta(ge=0, lt=1)]
 # Bounded, so that no description can ask for a network that does not fit memory.
