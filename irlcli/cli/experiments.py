@@ -191,8 +191,11 @@ def run(
         options = ClusterOptions(
             cluster or "slurm", partition, time, cpus, array_parallelism, sbatch, requeues, jobs
         )
-    elif detach:
-        raise UsageError("--detach is about jobs", "add --cluster slurm")
+    elif detach or partition is not None or sbatch:
+        given = "--detach" if detach else "--sbatch" if sbatch else "--partition"
+        raise UsageError(f"{given} is about jobs of a cluster", "add --cluster slurm, or omit it")
+    if status + cancel + detach > 1:
+        raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
     runner = session.runner()
     found = open_plan(session, choice)
     if options is not None and (status or cancel):

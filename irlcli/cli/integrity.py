@@ -125,8 +125,9 @@ def gc(
     session.check_exists()
     grace = grace_days * _DAY
     if delete:
-        artefacts, work = session.store.collect(grace)
-        with session.store.working_on(LOCK, wait=False):
+        # First of all: whoever submits jobs may hold it for long, and then nothing is deleted.
+        with session.store.working_on(LOCK, wait=False, what="a submission of jobs"):
+            artefacts, work = session.store.collect(grace)
             submissions = ended_submissions(session, grace)
             remove(submissions)
     else:

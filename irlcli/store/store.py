@@ -175,7 +175,11 @@ class Store:
 
     @contextmanager
     def working_on(
-        self, key: str, wait: bool, on_wait: Callable[[str], None] | None = None
+        self,
+        key: str,
+        wait: bool,
+        on_wait: Callable[[str], None] | None = None,
+        what: str = "the same artefact",
     ) -> Iterator[Scratch]:
         """Hold the lock and the working directory of ``key``.
 
@@ -185,7 +189,7 @@ class Store:
         """
         layouts.make_directories(self._writable)
         directory = self._layout.work / key
-        with exclusive(self._layout.locks / key, wait=wait, on_wait=on_wait):
+        with exclusive(self._layout.locks / key, wait=wait, on_wait=on_wait, what=what):
             if os.path.lexists(directory) and (directory.is_symlink() or not directory.is_dir()):
                 raise IntegrityError(f"{directory} is not a directory", "remove it")
             yield Scratch(directory)

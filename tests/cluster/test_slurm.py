@@ -400,6 +400,23 @@ def test_status_and_cancel(runs, cluster):
     assert set(states) <= {"RESUME", "RUN", "BLOCKED"} and states["RESUME"]
 
 
+def test_the_last_element_of_an_array_can_be_cancelled_alone(runs, cluster):
+    """It has the array's own id."""
+    done(runs.submit("--detach", IRL_TEST_ROUND="5"))
+    runs_now = ["squeue", "-h", "-r", "--name=irl", "--states=R", "-o", "%i %A"]
+    last = None
+    while last is None:
+        jobs = [line.split() for line in cluster.say(*runs_now).splitlines()]
+        last = next((i for i, raw in jobs if i.partition("_")[0] == raw), None)
+    time.sleep(2)
+    cluster.say("scancel", last)
+    limit = time.monotonic() + 60
+    while state := cluster.say("squeue", "-h", "-j", last, "-o", "%T").strip():
+        assert state in ("RUNNING", "COMPLETING") and time.monotonic() < limit, state
+        time.sleep(0.2)
+    done(runs.submit("--cancel"))
+
+
 def test_a_failure_stops_only_what_depends_on_it(runs, whole):
     errors = done(runs.submit(IRL_TEST_FAIL="train_airl pooled"), 1)
     assert "it was asked to fail" in errors and "hint: do not ask for it" in errors
@@ -416,7 +433,8 @@ def test_a_failure_stops_only_what_depends_on_it(runs, whole):
     "words, code, said",
     [
         (["--partition", "nowhere"], 2, "partitions: blind, main, urgent"),
-        (["--sbatch", "nothing=1"], 1, "nothing"),
+        (["--sbatch", "nothing=1"], 2, "nothing"),
+        (["--sbatch", "nodelist=nowhere"], 2, "Invalid node name"),
     ],
 )
 def test_bad_options_submit_nothing(runs, words, code, said):

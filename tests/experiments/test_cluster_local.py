@@ -56,7 +56,7 @@ def test_the_log_of_a_job_ends_in_how_far_it_is(tmp_path):
     assert record.last_line("7") == "  expert: 512/1,024 steps"
 
 
-def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path):
+def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path, monkeypatch):
     store = Store(tmp_path)
     store.create()
     names = "waiting", "done", "elsewhere"
@@ -71,6 +71,9 @@ def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path)
     (newer / "jobs-0000000.json").write_text('{"schema": 2}')
     time.sleep(0.05)
     assert ended(store, states.get, 3600.0) == []
+    with monkeypatch.context() as other:
+        other.setattr(os, "geteuid", lambda: 4321)
+        assert ended(store, states.get, 0.0) == []
     assert set(ended(store, states.get, 0.0)) == {made["done"].directory, leftover.absolute()}
 
 
@@ -119,6 +122,9 @@ def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_p
         (["--cluster", "slrum"], "did you mean 'slurm'?"),
         (["--cluster", "local", "--detach"], "must wait"),
         (["--detach"], "--cluster slurm"),
+        (["--partition", "long"], "--cluster slurm"),
+        (["--sbatch", "account=mine"], "--cluster slurm"),
+        (["--status", "--cancel"], "exclude each other"),
         (["--cluster", "local", "--time", "soon"], "4:00:00"),
         (["--cluster", "slurm", "--sbatch", "account"], "account=NAME"),
     ],

@@ -36,7 +36,14 @@ def probe(tmp_path, monkeypatch):
 
 
 def answer(**facts):
-    facts = {"host": "n1", "time": time.time(), "seen": True, "free": 1 << 40, **facts}
+    facts = {
+        "host": "n1",
+        "time": time.time(),
+        "seen": True,
+        "directory": True,
+        "free": 1 << 40,
+        **facts,
+    }
     return f"echo '{json.dumps(facts)}'"
 
 
@@ -47,6 +54,29 @@ def test_a_good_node_is_not_mentioned(probe):
 def test_a_store_out_of_sight(probe):
     with pytest.raises(StageFailed, match="the node n1 does not see the store"):
         probe(answer(seen=False))
+
+
+def test_a_working_directory_out_of_sight(probe):
+    with pytest.raises(StageFailed, match="the node n1 does not see the working directory"):
+        probe(answer(directory=False))
+
+
+def test_an_option_that_slurm_refuses(probe):
+    with pytest.raises(UsageError, match="refused: srun: unrecognized option '--nothing'"):
+        probe("""echo "srun: unrecognized option '--nothing'" >&2
+        echo 'Try "srun --help" for more information' >&2; exit 1""")
+
+
+def test_a_probe_from_inside_an_allocation_is_a_job_of_its_own(probe, monkeypatch):
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    assert probe(f'[ -z "$SLURM_JOB_ID" ] && {answer()}') == []
+
+
+def test_jobs_that_cannot_be_cancelled_are_an_error(probe, tmp_path):
+    probe(answer())
+    (tmp_path / "scancel").write_text("#!/bin/sh\necho 'error: Access denied' >&2; exit 1\n")
+    with pytest.raises(StageFailed, match="scancel: Access denied"):
+        Slurm(Resources()).cancel(["7"])
 
 
 def test_a_store_that_cannot_be_written(probe):
@@ -79,9 +109,10 @@ def test_a_node_without_python(probe):
 
 def test_a_node_looks_for_the_token(tmp_path):
     (tmp_path / ".jobs").mkdir()
-    assert look(tmp_path, "token")["seen"] is False
+    assert look(tmp_path, "token", tmp_path)["seen"] is False
     (tmp_path / ".jobs" / "token").touch()
-    assert look(tmp_path, "token").items() >= {"seen": True}.items()
+    assert look(tmp_path, "token", tmp_path).items() >= {"seen": True, "directory": True}.items()
+    assert look(tmp_path, "token", tmp_path / "elsewhere")["directory"] is False
     assert [path.name for path in (tmp_path / ".jobs").iterdir()] == ["token"]
 
 

@@ -1,6 +1,6 @@
 """What a node sees of the store: run there before anything is submitted.
 
-``python -m irlcli.experiments.cluster.probe STORE TOKEN`` prints a JSON document.
+``python -m irlcli.experiments.cluster.probe STORE TOKEN DIRECTORY`` prints a JSON document.
 """
 
 import json
@@ -11,10 +11,11 @@ import time
 from pathlib import Path
 
 
-def look(store: Path, token: str) -> dict[str, object]:
+def look(store: Path, token: str, directory: Path) -> dict[str, object]:
     """The facts about the node that can make jobs fail, or give other results."""
     seen = (store / ".jobs" / token).exists()
     facts: dict[str, object] = {"host": os.uname().nodename, "time": time.time(), "seen": seen}
+    facts["directory"] = directory.is_dir()
     if seen:
         own = store / ".jobs" / f"{token}.node"
         try:
@@ -27,4 +28,4 @@ def look(store: Path, token: str) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(look(Path(sys.argv[1]), sys.argv[2])))
+    print(json.dumps(look(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))))

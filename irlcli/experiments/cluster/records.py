@@ -122,6 +122,8 @@ def ended(
 ) -> list[Path]:
     """Directories and leftover files of submissions that have ended, unchanged for the grace period.
 
+    Only root finds those of other people.
+
     Args:
         store: holds them.
         states_at: the states of the jobs in the queue at a place, by id; None if it cannot be
@@ -133,6 +135,8 @@ def ended(
     found = []
     for path in sorted(store.jobs.absolute().glob("*")):
         record = known.get(path)
+        if not _may_judge(path):
+            continue
         if record is None and any(path.glob(_FILE.partition("{")[0] + "*")):
             # A newer irlcli wrote it.
             continue
@@ -143,6 +147,17 @@ def ended(
         if _changed(path) < limit:
             found.append(path)
     return found
+
+
+def _may_judge(path: Path) -> bool:
+    """Whether the queue shows this user the jobs of whoever wrote ``path``.
+
+    A cluster may hide the jobs of other people from everybody but root.
+    """
+    try:
+        return os.geteuid() in (0, path.stat().st_uid)
+    except FileNotFoundError:
+        return False
 
 
 def _changed(path: Path) -> float:

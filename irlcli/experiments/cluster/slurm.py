@@ -74,6 +74,9 @@ class Slurm:
         """
         import submitit
 
+        # sbatch prefers these to the script, and jobs of another name would not be found again.
+        for name in ("SBATCH_JOB_NAME", "SBATCH_TIMELIMIT", "SBATCH_NO_REQUEUE", "SBATCH_SIGNAL"):
+            os.environ.pop(name, None)
         conditions = [f"afterok:{':'.join(after)}"] if after else []
         conditions += [f"aftercorr:{matching}"] if matching else []
         more: dict[str, Any] = {
@@ -121,17 +124,27 @@ class Slurm:
         return {row[0]: " ".join(row[1:]) for row in rows if len(row) == 3}
 
     def cancel(self, ids: Iterable[str]) -> None:
-        """Cancel jobs; those that run write a checkpoint first."""
+        """Cancel jobs; those that run write a checkpoint first.
+
+        Raises:
+            StageFailed: Slurm refused to cancel some, for example those of other people.
+        """
         listed = list(ids)
         for start in range(0, len(listed), 500):
-            _say("scancel", *listed[start : start + 500])
+            done = _say("scancel", *listed[start : start + 500])
+            if done.returncode != 0:
+                raise StageFailed(
+                    f"scancel: {_reason(done.stderr)}",
+                    "the other jobs are cancelled; whoever submitted a job can cancel it",
+                )
 
     def probe(self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]) -> None:
         """Run a job that looks at the store from a node, and wait for it.
 
         Raises:
             UsageError: the partition or another option is wrong.
-            StageFailed: a node cannot start Python, or does not see or cannot write the store.
+            StageFailed: a node cannot start Python, does not see or cannot write the store, or
+                does not see the working directory.
         """
         token = f"probe-{os.urandom(8).hex()}"
         (store / ".jobs").mkdir(exist_ok=True)
@@ -146,7 +159,7 @@ class Slurm:
         waiting()
         try:
             before = time.time()
-            done = _say(*command, str(store.resolve()), token)
+            done = _say(*command, str(store.resolve()), token, str(Path.cwd()))
             after = time.time()
         finally:
             (store / ".jobs" / token).unlink(missing_ok=True)
@@ -159,6 +172,11 @@ class Slurm:
             raise StageFailed(
                 f"{where} does not see the store {store.resolve()}",
                 "put the store on a file system that the nodes share (--store)",
+            )
+        if not facts["directory"]:
+            raise StageFailed(
+                f"{where} does not see the working directory {Path.cwd()}",
+                "run the command in a directory on a file system that the nodes share",
             )
         if "problem" in facts:
             raise StageFailed(
@@ -182,6 +200,12 @@ def _refused(errors: str) -> UsageError | StageFailed:
         return UsageError(
             f"Slurm refused: {reason}", f"partitions: {', '.join(sorted(set(known)))}"
         )
+    refused = re.search("Unable to allocate|[Ii]nvalid|unrecognized option", errors)
+    if refused and not re.search("slurmstepd|task 0|Traceback", errors):
+        return UsageError(
+            f"Slurm refused: {reason}",
+            "nothing was submitted: check --cpus and --sbatch (srun --help lists options)",
+        )
     return StageFailed(
         f"the probe job failed: {reason}",
         f"nothing was submitted. The nodes must be able to start {sys.executable}, with its "
@@ -190,13 +214,22 @@ def _refused(errors: str) -> UsageError | StageFailed:
 
 
 def _say(*command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, errors="replace")
+    # Inside an allocation srun would start a step there, which may wait for the shell that asks.
+    # SQUEUE_STATES or SQUEUE_USERS would hide jobs, and their steps would be submitted again.
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("SLURM_", "SQUEUE_")) or name in ("SLURM_CONF", "SLURM_CLUSTERS")
+    }
+    return subprocess.run(command, capture_output=True, text=True, errors="replace", env=kept)
 
 
 def _reason(text: str) -> str:
     """The line of an error that says why."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
+    lines = [line for line in lines if "Exited with exit code" not in line] or lines
+    lines = [line for line in lines if not line.startswith('Try "')] or lines
     for line in reversed(lines):
         if "rror:" in line and "Unable to allocate" not in line:
             return line.partition("rror:")[2].strip()
-    return lines[-1] if lines else "no reason given"
+    return lines[-1].rpartition("allocate resources: ")[2] if lines else "no reason given"

@@ -1,5 +1,6 @@
 """The missing steps of a plan as jobs: submitted, and watched."""
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,6 +28,8 @@ from irlcli.stages import choose_penalty
 _LONGEST_PAUSE = 20.0
 # A controller that restarts, or is too busy to answer, comes back.
 _SILENCE_SECONDS = 600.0
+# Why a job waits that starts in time.
+_ORDINARY = ("None", "Dependency", "Priority", "Resources", "BeginTime", "JobArrayTaskLimit")
 
 
 class JobCommand(NamedTuple):
@@ -70,6 +73,7 @@ class Submission:
         self._arrays: list[Array] = []
         self._record: Record | None = None
         self._lost: set[str] = set()
+        self._explained: set[str] = set()
         self._stopped = False
         self._outcome = Outcome([], [], [], {}, [], False)
 
@@ -85,16 +89,17 @@ class Submission:
         self._display.begin(len(self._plan.tasks), len(self._plan.tasks) - len(missing))
         if not missing:
             return 0
-        with store.working_on(LOCK, wait=True):
-            there = queued(self._plan, self._queue, store)
-            for name in missing:
-                if name in there:
-                    self._ids[name] = there[name].job
-                    self._records[name] = there[name].record
-            new = [name for name in missing if name not in self._ids]
+
+        def wait_for(holder: str) -> None:
+            warn(f"waiting for {holder}, which submits jobs for this store")
+
+        with store.working_on(LOCK, wait=True, on_wait=wait_for):
+            new = self._find_queued(missing)
             if not new:
                 return 0
             self._queue.probe(store.root, waiting, warn)
+            # The probe may have waited for hours.
+            new = self._find_queued(missing)
             states = {self._queue.place: self._queue.states()}
             remove(ended(store, states.get, 0.0))
             needs = {name: [n for n in self._plan.needs[name] if n in missing] for name in new}
@@ -143,6 +148,8 @@ class Submission:
                             running[name] = time.monotonic()
                             self._display.start(name)
                         self._show_progress(name)
+                    else:
+                        self._explain(name, state)
                 if alive:
                     self._pause(time.monotonic() - started)
                 elif not self._any_ready():
@@ -152,6 +159,13 @@ class Submission:
         done = {*self._outcome.existed, *self._outcome.copied, *self._outcome.made}
         blocked = [n for n in self._plan.tasks if n not in done and n not in self._outcome.failed]
         return self._outcome._replace(blocked=blocked, interrupted=self._stopped)
+
+    def _find_queued(self, names: Sequence[str]) -> list[str]:
+        """Note the jobs of steps that are in the queue; returns the other steps."""
+        there = queued(self._plan, self._queue, self._runner.store)
+        self._ids = {name: there[name].job for name in names if name in there}
+        self._records = {name: there[name].record for name in self._ids}
+        return [name for name in names if name not in there]
 
     def _take_what_exists(self) -> None:
         """Name what is in the store; copy what another store has."""
@@ -249,6 +263,14 @@ class Submission:
         # Of a stage's lines, those that say how far it is are indented.
         if line.startswith("  "):
             self._display.line(name, line)
+
+    def _explain(self, name: str, state: str) -> None:
+        """Say once for each reason why Slurm does not start a job, unless time alone helps."""
+        found = re.fullmatch(r"PENDING \((.+)\)", state)
+        if found and found[1] not in _ORDINARY and found[1] not in self._explained:
+            self._explained.add(found[1])
+            text = f"warning: Slurm does not start job {self._ids[name]}: {found[1]}"
+            self._display.line(name, text)
 
     def _pause(self, elapsed: float) -> None:
         """Ask Slurm seldom when jobs are long."""
