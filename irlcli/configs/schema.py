@@ -73,6 +73,15 @@ class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     use_sde: bool = False
     sde_sample_freq: Count | None = None
 
+    @property
+    def steps_per_round(self) -> int:
+        """Of all worlds together."""
+        return self.rollouts_per_round * self.n_steps * self.n_envs
+
+    def rounds(self, total_steps: int) -> int:
+        """Rounds that make up at least ``total_steps``."""
+        return -(-total_steps // self.steps_per_round)
+
 
 class ExpertConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A policy trained on the true reward. ``bar`` is the mean true return that it must reach."""

@@ -112,12 +112,12 @@ class PPOTrainer:
     @property
     def steps_per_round(self) -> int:
         """Environment steps of one round."""
-        return _steps_per_round(self.ppo)
+        return self.ppo.steps_per_round
 
     @property
     def rounds(self) -> int:
         """Rounds that make up at least ``total_steps``."""
-        return rounds(self.ppo, self.total_steps)
+        return self.ppo.rounds(self.total_steps)
 
     @property
     def policy(self) -> Policy:
@@ -231,15 +231,6 @@ class PPOTrainer:
         self.model.policy.optimizer.load_state_dict(state["optimizer"])
         self.model.num_timesteps = int(state["steps"])
         self._deviation.load_state(state["reward_moments"])
-
-
-def rounds(ppo: PPOConfig, total_steps: int) -> int:
-    """Rounds that make up at least ``total_steps``."""
-    return -(-total_steps // _steps_per_round(ppo))
-
-
-def _steps_per_round(ppo: PPOConfig) -> int:
-    return ppo.rollouts_per_round * ppo.n_steps * ppo.n_envs
 
 
 def _policy_kwargs(ppo: PPOConfig) -> dict[str, Any]:

@@ -75,6 +75,12 @@ def request(
             f"{airl.ppo.n_envs} worlds cannot be shared equally by {trained} settings",
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
+    rounds = airl.ppo.rounds(airl.total_steps)
+    if (airl.averaged_rounds or 1) > rounds:
+        raise UsageError(
+            f"airl.averaged_rounds = {airl.averaged_rounds}, but training has {rounds} rounds",
+            f"--set airl.averaged_rounds={rounds} or less",
+        )
     if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
         raise UsageError(
             f"airl.batch_size = {airl.batch_size} cannot hold an even number of samples of each of "
@@ -130,7 +136,7 @@ def run(job: Job) -> None:
     from irlcli.learners.selection import BestRound, hold_out, log_likelihood
     from irlcli.rl.challengers import Challengers
     from irlcli.rl.loop import LastRound, Training
-    from irlcli.rl.ppo import PPOTrainer, rounds
+    from irlcli.rl.ppo import PPOTrainer
     from irlcli.rl.rollout import roll_out
     from irlcli.rl.worlds import action_space, make_worlds, observation_size
 
@@ -165,12 +171,6 @@ def run(job: Job) -> None:
         trainer = PPOTrainer(
             worlds, airl.ppo, airl.total_steps, p.seed, STAGE.name, keep_moments=airl.bc_epochs > 0
         )
-        if (airl.averaged_rounds or 1) > trainer.rounds:
-            raise UsageError(
-                f"airl.averaged_rounds = {airl.averaged_rounds}, but training has "
-                f"{trainer.rounds} rounds",
-                f"--set airl.averaged_rounds={trainer.rounds} or less",
-            )
         try:
             learner = learner_class(airl.learner)(
                 episodes,
@@ -197,8 +197,7 @@ def run(job: Job) -> None:
         selector: LastRound | BestRound = LastRound()
         if airl.select != "last":
             score = likelihood if airl.select == "episodes" else true_return
-            total = rounds(airl.ppo, airl.total_steps)
-            selector = BestRound(score, learner, airl.select_every, total)
+            selector = BestRound(score, learner, airl.select_every, trainer.rounds)
         challengers = None
         if airl.challenger.life > 0:
             challengers = Challengers(worlds, airl.challenger, learner, p.seed, STAGE.name)

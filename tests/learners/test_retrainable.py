@@ -301,3 +301,10 @@ def test_a_mean_has_no_best_round():
     config = AIRLConfig(averaged_rounds=2, select="episodes")
     with pytest.raises(UsageError, match="averaged_rounds = 2 cannot be combined"):
         relevant_airl(config, True)
+
+
+def test_a_mean_of_more_rounds_than_there_are_is_refused_before_anything_runs(irl, smoke_store):
+    line = ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", smoke_store.path]
+    done = irl(*line, "--dry-run", "--set", "airl.averaged_rounds=1000")
+    assert done.code == 2
+    assert "airl.averaged_rounds = 1000, but training has" in done.err

@@ -55,7 +55,10 @@ class Slurm:
         done = _say("scontrol", "show", "config")
         found = re.search(r"^ClusterName\s*=\s*(\S+)", done.stdout, re.MULTILINE)
         if not found:
-            raise StageFailed(f"scontrol: {_reason(done.stderr)}", "is the controller up?")
+            raise StageFailed(
+                f"scontrol: {_reason(done.stderr)}",
+                "look at `scontrol ping`; add --cluster local if the jobs run on this machine",
+            )
         return f"slurm cluster {found[1]}"
 
     def submit(
