@@ -45,7 +45,7 @@ COMMANDS = {
     "push": ("share", "Copy artefacts and all they were made from to a directory or URL."),
     "pull": ("share", "Copy artefacts and all they were made from out of a directory or URL."),
     "verify": ("integrity", "Check stored bytes against their digests."),
-    "gc": ("integrity", "List or delete artefacts that no name depends on."),
+    "gc": ("integrity", "List or delete artefacts that no name depends on, and old job logs."),
 }
 
 

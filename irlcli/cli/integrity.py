@@ -117,7 +117,7 @@ def gc(
         float, typer.Option(min=0, help="Keep what is younger than this [days].")
     ] = 7.0,
 ) -> None:
-    """List or delete artefacts that no name depends on, and logs of a cluster's jobs."""
+    """List or delete artefacts that no name depends on, and old job logs."""
     if not grace_days >= 0:
         raise UsageError(f"--grace-days {grace_days} is not a number of days", "write 0 or more")
     from irlcli.experiments.cluster.records import LOCK, remove
