@@ -87,6 +87,7 @@ def learned(config: Mapping[str, Any]) -> str:
             f"selected by {select}" if select != "last" else None,
             "from a clone" if config.get("bc_epochs") else None,
             f"mean of {rounds} rounds" if (rounds := config.get("averaged_rounds")) else None,
+            "to a plateau" if config.get("plateau_rounds") else None,
             "with challengers" if isinstance(challenger, dict) and challenger.get("life") else None,
         ]
     )

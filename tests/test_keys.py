@@ -266,8 +266,9 @@ UNREAD = {
     # Of other parts of the control.
     "control-maps": [f"control.maps.{n}" for n in ("settings", "spread", "gaps", "choices")],
 }
-# Challengers need logits without log pi, and a mean of rounds has no best round.
-REFUSED = ["airl.ppo.use_sde", "airl.logit", "airl.averaged_rounds"]
+# Challengers need logits without log pi. A mean of rounds has no best round, nor has a training that
+# may end early.
+REFUSED = ["airl.ppo.use_sde", "airl.logit", "airl.averaged_rounds", "airl.plateau_rounds"]
 # Fields whose type does not tell another valid value.
 CHANGED = {
     "expert.bar": 1.0,
@@ -277,6 +278,7 @@ CHANGED = {
     "airl.dropout": 0.5,
     "airl.columns": (-1,),
     "airl.averaged_rounds": 3,
+    "airl.plateau_rounds": 3,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
     "transfer.sac.tau": 0.1,
@@ -506,6 +508,11 @@ def test_the_last_round_alone_is_in_no_key():
     last = with_field(in_use(), "airl.select", "last")
     one, three = (with_field(last, "airl.averaged_rounds", rounds) for rounds in (1, 3))
     assert key(airl(one)) == key(airl(last)) != key(airl(three))
+
+
+def test_training_to_the_end_is_in_no_key():
+    last = with_field(in_use(), "airl.select", "last")
+    assert key(airl(last)) != key(airl(with_field(last, "airl.plateau_rounds", 10)))
 
 
 def test_no_warm_up_is_in_no_key():

@@ -109,6 +109,17 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
             f"{airl.select}: a mean of rounds has no best round",
             "--set airl.select=last, or omit airl.averaged_rounds",
         )
+    if airl.plateau_rounds is not UNSET:
+        for name, value, other in (
+            ("select", airl.select, "last"),
+            ("averaged_rounds", airl.averaged_rounds, UNSET),
+        ):
+            if value != other:
+                raise UsageError(
+                    f"airl.plateau_rounds = {airl.plateau_rounds} cannot be combined with airl.{name} "
+                    f"= {value}: that takes the whole budget",
+                    f"omit airl.plateau_rounds or airl.{name}",
+                )
     if airl.grouping == "pooled":
         airl = replace(airl, pairing=_AIRL.pairing)
     if airl.logit == "f":

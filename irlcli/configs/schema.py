@@ -219,6 +219,9 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             from the end. The policy sees all. Unset (or empty) is all, and in no key.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
             equally spaced up to the last. Unset (or 1) is the last g alone, and in no key.
+        plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is
+            near chance and has not risen for so many rounds, those of the penalty's warm-up and ramp
+            not counted (:mod:`irlcli.learners.stopping`). Unset trains to the end, and is in no key.
         select: the round that is kept: ``last``, the best on held-out ``episodes``, or the best in
             one setting (``leg-length=1x``), which is left out of training. Scored every
             ``select_every`` rounds, a setting over ``select_episodes``.
@@ -261,6 +264,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     dropout: Dropout | UnsetType = UNSET
     columns: Columns | UnsetType = UNSET
     averaged_rounds: Members | UnsetType = UNSET
+    plateau_rounds: Count | UnsetType = UNSET
 
 
 class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -66,7 +66,8 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 
     ``scale`` is the standard deviation of g on the training data. ``quantiles`` are the 0, 1, ...
     100 % quantiles of g on the demonstrations; None in files of version 0.1. ``selected`` is None
-    if the last round is deployed.
+    if the last round is deployed. ``stopped_after`` are the rounds before ``airl.plateau_rounds``
+    ended the training; None if the budget was used.
     """
 
     env: str
@@ -78,6 +79,7 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     scale: Positive
     quantiles: Quantiles | None = None
     selected: Selected | None = None
+    stopped_after: Annotated[int, Meta(ge=1)] | None = None
 
 
 class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -144,6 +144,7 @@ class Training:
         selector: chooses the round that is kept.
         settings: of the worlds, in their order.
         challengers: whose rollouts the learner learns from, too.
+        ends: whether training ends before the trainer's last round, by the rows so far.
     """
 
     def __init__(
@@ -154,6 +155,7 @@ class Training:
         selector: Selector,
         settings: Sequence[str],
         challengers: Challengers | None = None,
+        ends: Callable[[Sequence[Row]], bool] = lambda rows: False,
     ):
         self.trainer = trainer
         self.source = source
@@ -161,6 +163,7 @@ class Training:
         self.selector = selector
         self.settings = list(settings)
         self.challengers = challengers
+        self._ends = ends
         self.rounds_done = 0
         self.rows: list[Row] = []
 
@@ -169,10 +172,13 @@ class Training:
         after_round: Callable[[Training, list[Row]], None],
         warn: Callable[[str], None],
     ) -> list[Row]:
-        """Train to the last round and return all rows; ``after_round`` gets each round's rows."""
+        """Train to the last round, or to where ``ends`` says so, and return all rows; ``after_round`` gets each round's rows."""
         if self.rounds_done == 0:
             self.learner.begin(self.trainer)
         for index in range(self.rounds_done, self.trainer.rounds):
+            # Here, not at the end: a resumed run may have been killed after its last round.
+            if self._ends(self.rows):
+                break
             rollouts = self.trainer.train_round(index, self.source)
             challenge = [] if self.challengers is None else self.challengers.train_round(index)
             diagnostics = self.learner.update(index, rollouts, self.trainer.policy, challenge)

@@ -199,7 +199,14 @@ def run_training(job: Job, training: Training) -> list[Row]:
         _report(job, training, newest)
         job.checkpoints.offer(encoded)
 
-    return training.run(after_round, job.console.warn)
+    rows = training.run(after_round, job.console.warn)
+    if training.rounds_done < training.trainer.rounds:
+        steps, early = (
+            training.trainer.steps,
+            f"{training.rounds_done} of {training.trainer.rounds}",
+        )
+        job.console.progress(steps, steps, "steps", {"ended after": f"{early} rounds"})
+    return rows
 
 
 def run_parts(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -134,6 +134,7 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_metrics, write_policy, write_reward
     from irlcli.learners import learner as learner_class
     from irlcli.learners.selection import BestRound, hold_out, log_likelihood
+    from irlcli.learners.stopping import cross_entropies, plateaued
     from irlcli.rl.challengers import Challengers
     from irlcli.rl.loop import LastRound, Training
     from irlcli.rl.ppo import PPOTrainer
@@ -201,12 +202,23 @@ def run(job: Job) -> None:
         challengers = None
         if airl.challenger.life > 0:
             challengers = Challengers(worlds, airl.challenger, learner, p.seed, STAGE.name)
-        training = Training(trainer, learner, learner, selector, settings, challengers)
+
+        def at_a_plateau(rows: Sequence[Mapping[str, Any]]) -> bool:
+            if isinstance(airl.plateau_rounds, msgspec.UnsetType):
+                return False
+            # Until then the loss itself changes.
+            first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
+            return plateaued(cross_entropies(rows, first), airl.plateau_rounds)
+
+        training = Training(
+            trainer, learner, learner, selector, settings, challengers, at_a_plateau
+        )
         rows = run_training(job, training)
     selected = None
     if isinstance(selector, BestRound):
         best = selector.best
         selected = descriptions.Selected(round=best["round"], score=best["score"])
+    stopped = training.rounds_done if training.rounds_done < trainer.rounds else None
     origin = {
         "env": env,
         "settings": settings,
@@ -214,7 +226,7 @@ def run(job: Job) -> None:
         "seed": p.seed,
     }
     write_policy(job.output, trainer.policy, airl.ppo, agent="student", **origin)
-    write_reward(job.output, learner, airl=airl, selected=selected, **origin)
+    write_reward(job.output, learner, airl=airl, selected=selected, stopped_after=stopped, **origin)
     write_metrics(job.output, rows)
 
 

@@ -1,0 +1,103 @@
+"""Adversarial training that ends at a plateau of the discriminator's cross-entropy."""
+
+import json
+import math
+
+import pyarrow.parquet as pq
+import pytest
+from airl_runs import make, random_episodes
+
+from irlcli.labels import describe
+from irlcli.learners.stopping import NEAR_CHANCE, cross_entropies, plateaued
+from irlcli.rl.loop import LastRound, Training
+from irlcli.store import Store, read_json
+
+COIN = math.log(2.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "ends"),
+    [
+        ([COIN] * 4, True),
+        ([COIN] * 3, False),
+        ([0.66, 0.67, 0.68, 0.69], False),
+        ([0.69, 0.69, 0.70, 0.68], True),
+        # Only the last rounds count, and those before them.
+        ([0.1, 0.2, 0.69, 0.69, 0.69, 0.69], True),
+        # A student that fails: nothing rises, but the discriminator tells the two apart.
+        ([0.6] * 4, False),
+        ([NEAR_CHANCE + 1e-9] * 4, True),
+    ],
+)
+def test_a_plateau_is_near_chance_and_no_higher_than_before(values, ends):
+    assert plateaued(values, 2) is ends
+
+
+def test_settings_count_alike_and_rounds_before_the_first_do_not():
+    rows = [
+        {"round": index, "setting": setting, "cross_entropy": index + value}
+        for index in range(4)
+        for setting, value in (("one", 0.2), ("other", 0.4))
+    ]
+    assert cross_entropies(rows, 2) == pytest.approx([2.3, 3.3])
+    assert cross_entropies([], 0) == []
+
+
+def test_a_run_killed_after_its_last_round_trains_no_further():
+    def training():
+        trainer, learner = make(random_episodes(1), total_steps=3 * 8 * 64)
+        ends = lambda rows: len(rows) >= 4  # noqa: E731
+        return Training(trainer, learner, learner, LastRound(), ["one", "other"], ends=ends)
+
+    saved = []
+    rows = training().run(lambda t, _: saved.append((t.state_dict(), list(t.rows))), pytest.fail)
+    assert len(saved) == 2 and len(rows) == 4
+    resumed = training()
+    resumed.load_state_dict(*saved[-1])
+    assert resumed.run(lambda t, _: pytest.fail("trained on"), pytest.fail) == rows
+
+
+@pytest.fixture(scope="module")
+def line(smoke_store, tmp_path_factory):
+    """A training whose cross-entropy falls from above chance, so that two rounds are a plateau."""
+    import shutil
+
+    path = tmp_path_factory.mktemp("plateau") / "runs"
+    shutil.copytree(smoke_store.path, path)
+    return ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", str(path), "--json"]
+
+
+def test_training_ends_at_the_plateau_and_says_so(line, run_irl):
+    done = run_irl([*line, "--set", "airl.plateau_rounds=1"])
+    assert done.code == 0, done.err
+    assert "ended after 2 of 3 rounds" in done.err
+    store = Store(line[line.index("--store") + 1])
+    artefact = store.resolve(json.loads(done.out)["id"]).artefact
+    reward = read_json(store.open(artefact, "reward.json"))
+    assert reward["stopped_after"] == 2
+    rows = pq.read_table(store.open(artefact, "metrics.parquet")).to_pylist()
+    assert {row["round"] for row in rows} == {0, 1}
+    losses = cross_entropies(rows, 0)
+    assert NEAR_CHANCE <= losses[1] <= losses[0]
+    assert "to a plateau" in describe(artefact.manifest.record)
+
+
+def test_a_training_that_never_gets_there_uses_its_budget(line, run_irl):
+    """And is another artefact than without the rule: its key cannot know."""
+    done = run_irl([*line, "--set", "airl.plateau_rounds=2"])
+    assert done.code == 0, done.err
+    assert "ended after" not in done.err
+    store = Store(line[line.index("--store") + 1])
+    reward = read_json(
+        store.open(store.resolve(json.loads(done.out)["id"]).artefact, "reward.json")
+    )
+    assert "stopped_after" not in reward
+
+
+@pytest.mark.parametrize("other", ["airl.select=episodes", "airl.averaged_rounds=2"])
+def test_what_takes_the_whole_budget_is_refused(line, run_irl, other):
+    done = run_irl([*line, "--set", "airl.plateau_rounds=1", "--set", other])
+    assert done.code == 2
+    message, hint = done.err.strip().splitlines()[-2:]
+    assert "airl.plateau_rounds = 1" in message and other.split("=")[0] in message
+    assert other.split("=")[0] in hint
