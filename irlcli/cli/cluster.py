@@ -19,25 +19,55 @@ if TYPE_CHECKING:
     from irlcli.experiments.runner import Runner
 
 CLUSTERS = ("slurm", "local")
+DEFAULT_TIME, DEFAULT_CPUS, DEFAULT_PARALLELISM, DEFAULT_REQUEUES = "4:00:00", 1, 50, 20
 _WARNING_SECONDS = 90
 
 
 class ClusterOptions(NamedTuple):
-    """The options of ``irl run`` about jobs.
+    """The options of ``irl run`` about jobs, None where they were not given.
 
     Attributes:
         cluster: ``slurm`` or ``local``.
         local_jobs: processes at a time of ``local``, which has no partition.
     """
 
-    cluster: str
+    cluster: str | None
     partition: str | None
-    time: str
-    cpus: int
-    parallelism: int
+    time: str | None
+    cpus: int | None
+    parallelism: int | None
     sbatch: Sequence[str]
-    requeues: int
+    requeues: int | None
     local_jobs: int
+
+    def check_used(self, detach: bool) -> None:
+        """Refuse options that a run with this ``--cluster`` would ignore.
+
+        Raises:
+            UsageError: names the first of them.
+        """
+        slurm = {
+            "--partition": self.partition is not None,
+            "--cpus": self.cpus is not None,
+            "--array-parallelism": self.parallelism is not None,
+            "--sbatch": bool(self.sbatch),
+        }
+        both = {
+            "--detach": detach,
+            "--time": self.time is not None,
+            "--requeues": self.requeues is not None,
+        }
+        if self.cluster is None:
+            for option in (name for name, given in (slurm | both).items() if given):
+                raise UsageError(
+                    f"{option} is about jobs of a cluster", "add --cluster slurm, or omit it"
+                )
+        if self.cluster == "local":
+            for option in (name for name, given in slurm.items() if given):
+                raise UsageError(
+                    f"{option} is about Slurm's jobs; --cluster local runs them on this machine",
+                    "omit it; --jobs sets how many run at a time",
+                )
 
 
 def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
@@ -46,20 +76,19 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     Raises:
         UsageError: an unknown name or option, or Slurm or submitit is missing.
     """
+    cluster = options.cluster or "slurm"
     from irlcli.experiments.cluster.local import Local
     from irlcli.experiments.cluster.resources import Resources, parse_minutes
     from irlcli.experiments.cluster.slurm import Slurm
 
-    if options.cluster not in CLUSTERS:
-        raise UsageError(
-            f"unknown --cluster {options.cluster!r}", suggest(options.cluster, CLUSTERS)
-        )
+    if cluster not in CLUSTERS:
+        raise UsageError(f"unknown --cluster {cluster!r}", suggest(cluster, CLUSTERS))
     if importlib.util.find_spec("submitit") is None:
         raise UsageError(
             "--cluster needs the package submitit, which is not installed",
             f"{sys.executable} -m pip install 'irlcli[slurm]'",
         )
-    minutes = parse_minutes(options.time)
+    minutes = parse_minutes(options.time or DEFAULT_TIME)
     # A job of few minutes is warned when half of them are over.
     warning = min(_WARNING_SECONDS, 30 * minutes)
     extra = {}
@@ -71,9 +100,36 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
             )
         extra[name] = value
     resources = Resources(
-        options.partition, minutes, options.cpus, options.parallelism, warning, extra
+        options.partition,
+        minutes,
+        options.cpus or DEFAULT_CPUS,
+        options.parallelism or DEFAULT_PARALLELISM,
+        warning,
+        extra,
     )
-    return Slurm(resources) if options.cluster == "slurm" else Local(session.store, resources)
+    return Slurm(resources) if cluster == "slurm" else Local(session.store, resources)
+
+
+def _queue_of(session: StageSession, found: "Plan", options: ClusterOptions) -> "Queue":
+    """The queue that ``--cluster`` names, or the one that has the plan's jobs.
+
+    Raises:
+        UsageError: this machine cannot ask that queue.
+    """
+    from irlcli.experiments.cluster.queue import last_place
+
+    if options.cluster is not None:
+        return open_queue(session, options)
+    place = last_place(found, session.store)
+    # Without a record there is no job: Slurm need not be asked.
+    slurm = place is not None and place.startswith("slurm ")
+    queue = open_queue(session, options._replace(cluster="slurm" if slurm else "local"))
+    if place not in (None, queue.place):
+        raise UsageError(
+            f"{found.table.name} was submitted to: {place}. This machine has: {queue.place}",
+            "run the same command there, or name a queue of this machine with --cluster",
+        )
+    return queue
 
 
 def run_jobs(
@@ -100,7 +156,12 @@ def run_jobs(
         return [sys.executable, "-m", "irlcli", *words(name), *impatient]
 
     display = job_display(session.console)
-    job = JobCommand(command, Path.cwd(), options.requeues, options.local_jobs)
+    job = JobCommand(
+        command,
+        Path.cwd(),
+        DEFAULT_REQUEUES if options.requeues is None else options.requeues,
+        options.local_jobs,
+    )
     submission = Submission(found, runner, queue, job, display)
     try:
         count = submission.submit(
@@ -144,7 +205,7 @@ def print_status(session: StageSession, found: "Plan", options: ClusterOptions) 
     from irlcli.experiments.cluster.queue import queued
     from irlcli.experiments.cluster.records import records
 
-    queue = open_queue(session, options)
+    queue = _queue_of(session, found, options)
     there = queued(found, queue, session.store)
     submissions = records(session.store, queue.place)
     lines: list[dict[str, str | None]] = []
@@ -170,14 +231,15 @@ def print_status(session: StageSession, found: "Plan", options: ClusterOptions) 
         return
     for line in lines:
         out.print_data(f"{line['state']:11}{line['name']}: {line['why']}")
-    out.print_note(f"{exist} of {len(found.tasks)} steps exist, {len(there)} have a job")
+    jobs = sum(line["job"] is not None for line in lines)
+    out.print_note(f"{exist} of {len(found.tasks)} steps exist, {jobs} have a job")
 
 
 def cancel(session: StageSession, found: "Plan", options: ClusterOptions) -> None:
     """Cancel the jobs of a table; those that run write a checkpoint first."""
     from irlcli.experiments.cluster.queue import queued
 
-    queue = open_queue(session, options)
+    queue = _queue_of(session, found, options)
     there = queued(found, queue, session.store)
     queue.cancel(sorted({job.job for job in there.values()}))
     if session.as_json:

@@ -136,13 +136,28 @@ def run(
         str | None, typer.Option(help="Slurm's partition.", rich_help_panel=_JOBS)
     ] = None,
     time: Annotated[
-        str, typer.Option(help="Time limit of a job, e.g. 90 or 4:00:00.", rich_help_panel=_JOBS)
-    ] = "4:00:00",
-    cpus: Annotated[int, typer.Option(min=1, help="CPUs of a job.", rich_help_panel=_JOBS)] = 1,
+        str | None,
+        typer.Option(
+            help=f"Time limit of a job, e.g. 90 or 1-12. Default: {cluster_jobs.DEFAULT_TIME}.",
+            rich_help_panel=_JOBS,
+        ),
+    ] = None,
+    cpus: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help=f"CPUs of a job. Default: {cluster_jobs.DEFAULT_CPUS}.",
+            rich_help_panel=_JOBS,
+        ),
+    ] = None,
     array_parallelism: Annotated[
-        int,
-        typer.Option(min=1, help="Jobs of an array that run at a time.", rich_help_panel=_JOBS),
-    ] = 50,
+        int | None,
+        typer.Option(
+            min=1,
+            help=f"Jobs of an array that run at a time. Default: {cluster_jobs.DEFAULT_PARALLELISM}.",
+            rich_help_panel=_JOBS,
+        ),
+    ] = None,
     sbatch: Annotated[
         list[str],
         typer.Option(
@@ -152,9 +167,13 @@ def run(
         ),
     ] = [],  # noqa: B006
     requeues: Annotated[
-        int,
-        typer.Option(min=0, help="How often a stopped job may go on.", rich_help_panel=_JOBS),
-    ] = 20,
+        int | None,
+        typer.Option(
+            min=0,
+            help=f"How often a stopped job may go on. Default: {cluster_jobs.DEFAULT_REQUEUES}.",
+            rich_help_panel=_JOBS,
+        ),
+    ] = None,
     detach: Annotated[
         bool, typer.Option("--detach", help="Submit and exit.", rich_help_panel=_JOBS)
     ] = False,
@@ -186,19 +205,16 @@ def run(
         raise UsageError("--until makes no report, so --out has no files", "omit one of them")
     if only is not None and cluster is not None:
         raise UsageError("--only makes one step, in this process", "omit --cluster or --only")
-    options = None
-    if cluster is not None or status or cancel:
-        options = ClusterOptions(
-            cluster or "slurm", partition, time, cpus, array_parallelism, sbatch, requeues, jobs
-        )
-    elif detach or partition is not None or sbatch:
-        given = "--detach" if detach else "--sbatch" if sbatch else "--partition"
-        raise UsageError(f"{given} is about jobs of a cluster", "add --cluster slurm, or omit it")
+    options = ClusterOptions(
+        cluster, partition, time, cpus, array_parallelism, sbatch, requeues, jobs
+    )
+    if cluster is not None or not (status or cancel):
+        options.check_used(detach)
     if status + cancel + detach > 1:
         raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
     runner = session.runner()
     found = open_plan(session, choice)
-    if options is not None and (status or cancel):
+    if status or cancel:
         (cluster_jobs.print_status if status else cluster_jobs.cancel)(session, found, options)
         return
     if directory is not None:
@@ -208,7 +224,7 @@ def run(
         if only is not None:
             _make_one(session, runner, found, only)
             return
-        if options is None:
+        if cluster is None:
             outcome = _make_all(session, runner, found, choice, jobs)
         else:
             words = _child_words(session, choice, found)

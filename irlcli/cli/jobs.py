@@ -54,9 +54,9 @@ class PlainJobs:
         if failure.hint:
             self._console.say(f"hint: {failure.hint}")
 
-    def stopping(self) -> None:
+    def stopping(self, again: str = "to stop at once") -> None:
         self._console.warn(
-            "stopping: running steps write a checkpoint (repeat the signal to stop at once)"
+            f"stopping: running steps write a checkpoint (repeat the signal {again})"
         )
 
     def close(self) -> None:

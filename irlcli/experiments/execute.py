@@ -65,8 +65,11 @@ class Display(Protocol):
     def failed(self, name: str, failure: Failure) -> None:
         """A step failed."""
 
-    def stopping(self) -> None:
-        """A signal asked to stop; running steps write a checkpoint."""
+    def stopping(self, again: str = "to stop at once") -> None:
+        """A signal asked to stop; running steps write a checkpoint.
+
+        ``again`` is why somebody would repeat the signal.
+        """
 
 
 class _Child:

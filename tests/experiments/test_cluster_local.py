@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from test_run import REWARDS, ROW, Runs
+from test_run import REWARDS, ROW, Runs, alive
 
 from irlcli.experiments.cluster.records import Submitted, ended, new_record
 from irlcli.store import Store
@@ -116,6 +116,38 @@ def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_p
     assert max(runs.computed().values()) == 2
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_ctrl_c_stops_the_jobs_at_a_checkpoint(irl, runs, tmp_path, monkeypatch):
+    """The terminal signals the whole process group: submitit's processes and the steps' as well."""
+    store = tmp_path / "runs"
+    line = (store, "--cluster", "local", "--jobs", "2", "--until", "experts")
+    process = runs.start(*line, IRL_TEST_ROUND="1.5")
+    while sum("computes" in line for line in runs.lines()) < 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    # Nobody names the queue: the record knows it, and no Slurm is asked.
+    monkeypatch.setattr("shutil.which", lambda command: None)
+    shown = irl(*runs.words, "--store", store, "--status", "--until", "experts")
+    assert shown.out.count(f" {os.uname().nodename}\n") == 2, shown
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 130
+    stopping, stopped, hint = errors.splitlines()[-3:]
+    assert stopping.startswith("warning: stopping") and "Traceback" not in errors, errors
+    assert stopped.startswith("error: stopped: ") and "same command again" in hint
+    assert not alive(line["pid"] for line in runs.lines())
+    assert len(list(store.glob(".work/*/checkpoint"))) == 2
+
+
+def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):
+    store = Store(tmp_path / "runs")
+    store.create()
+    step = f"{ROW}.expert.1x"
+    new_record(store, "local on moon").add([Submitted(step, "identity", "1")])
+    done = irl(*runs.words, "--store", store.root, "--status")
+    assert done.code == 2 and "local on moon" in done.err and "hint: " in done.err
+
+
 @pytest.mark.parametrize(
     "words, said",
     [
@@ -124,6 +156,14 @@ def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_p
         (["--detach"], "--cluster slurm"),
         (["--partition", "long"], "--cluster slurm"),
         (["--sbatch", "account=mine"], "--cluster slurm"),
+        (["--time", "4:00:00"], "--cluster slurm"),
+        (["--cpus", "2"], "--cluster slurm"),
+        (["--array-parallelism", "2"], "--cluster slurm"),
+        (["--requeues", "0"], "--cluster slurm"),
+        (["--cluster", "local", "--partition", "long"], "--partition is about Slurm"),
+        (["--cluster", "local", "--cpus", "1"], "--cpus is about Slurm"),
+        (["--cluster", "local", "--array-parallelism", "9"], "--array-parallelism is about"),
+        (["--cluster", "local", "--sbatch", "mem=4G"], "--sbatch is about Slurm"),
         (["--status", "--cancel"], "exclude each other"),
         (["--cluster", "local", "--time", "soon"], "4:00:00"),
         (["--cluster", "slurm", "--sbatch", "account"], "account=NAME"),

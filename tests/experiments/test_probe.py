@@ -26,7 +26,7 @@ def probe(tmp_path, monkeypatch):
         for path in tmp_path.glob("s*"):
             path.chmod(0o755)
         warnings = []
-        slurm = Slurm(Resources("P"))
+        slurm = Slurm(Resources("P", cpus=3))
         (tmp_path / "runs").mkdir()
         slurm.probe(tmp_path / "runs", lambda: None, warnings.append)
         assert list((tmp_path / "runs" / ".jobs").iterdir()) == []
@@ -65,6 +65,22 @@ def test_an_option_that_slurm_refuses(probe):
     with pytest.raises(UsageError, match="refused: srun: unrecognized option '--nothing'"):
         probe("""echo "srun: unrecognized option '--nothing'" >&2
         echo 'Try "srun --help" for more information' >&2; exit 1""")
+
+
+def test_the_probe_asks_for_what_the_jobs_ask_for(probe):
+    """A node that has no room for a job refuses the probe, before anything is submitted."""
+    asked = 'case "$*" in *--partition=P*--cpus-per-task=3*)'
+    assert probe(f"{asked} {answer()};; *) exit 1;; esac") == []
+
+
+def test_a_probe_that_waits_says_why_unless_the_partition_is_just_full(probe, tmp_path):
+    full = "echo 'srun: job 1 queued and waiting for resources' >&2; "
+    full += "echo 'srun: job 1 has been allocated resources' >&2; "
+    assert probe(full + answer()) == []
+    (tmp_path / "runs" / ".jobs").rmdir()
+    (tmp_path / "runs").rmdir()
+    (warning,) = probe("echo 'srun: Requested nodes are busy' >&2; " + full + answer())
+    assert warning == "Slurm does not start the probe job: Requested nodes are busy"
 
 
 def test_a_probe_from_inside_an_allocation_is_a_job_of_its_own(probe, monkeypatch):

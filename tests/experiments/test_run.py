@@ -42,10 +42,10 @@ class Runs:
         self.log.touch()
         self.tables = directory / "tables.toml"
         self.tables.write_text(TABLES)
+        self.words = ["run", "tiny", "--experiments", str(self.tables), "--profile", "smoke"]
 
     def start(self, store: Path, *more: object, **environment: str) -> subprocess.Popen:
-        words = ["run", "tiny", "--experiments", self.tables, "--profile", "smoke"]
-        line = [sys.executable, "-m", "irlcli", *words, "--store", store, *more]
+        line = [sys.executable, "-m", "irlcli", *self.words, "--store", store, *more]
         fakes = str(Path(__file__).parent / "fake_stages")
         path = os.pathsep.join([fakes, *filter(None, [os.environ.get("PYTHONPATH")])])
         return subprocess.Popen(
@@ -54,6 +54,8 @@ class Runs:
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "PYTHONPATH": path, "IRL_TEST_LOG": str(self.log), **environment},
+            # As a shell starts it: Ctrl-C is a signal to this group.
+            process_group=0,
         )
 
     def run(self, store: Path, *more: object, code: int = 0, **environment: str) -> str:
@@ -250,12 +252,12 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
         ended = {line["pid"] for line in runs.lines()[begin:] if "exits" in line}
         assert (computing <= ended) == (count == 1)
         assert list(store.glob(".work/*/checkpoint"))
-    assert not _alive(line["pid"] for line in runs.lines())
+    assert not alive(line["pid"] for line in runs.lines())
     runs.run(store, *REWARDS)
     assert Store(store).ids() == ids
 
 
-def _alive(pids):
+def alive(pids):
     found = []
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):

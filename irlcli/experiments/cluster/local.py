@@ -38,14 +38,19 @@ class Local:
         executor.update_parameters(
             timeout_min=self._resources.minutes, signal_delay_s=self._resources.warning
         )
-        started = [executor.submit(StepJob.run, job) for job in jobs]
+        # The jobs inherit the mask: Ctrl-C on the terminal reaches them through this process only.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            started = [executor.submit(StepJob.run, job) for job in jobs]
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._jobs |= {job.job_id: job for job in started}
         return [job.job_id for job in started]
 
     def states(self) -> dict[str, str]:
-        """``RUNNING`` for each job that has not ended, by id, those of earlier commands included."""
+        """State and host of each job that has not ended, by id, those of earlier commands included."""
         ids = {s.job for record in records(self._store, self.place) for s in record.jobs}
-        return {i: "RUNNING" for i in ids if self._runs(i)}
+        return {i: f"RUNNING {os.uname().nodename}" for i in ids if self._runs(i)}
 
     def _runs(self, job: str) -> bool:
         if job in self._jobs:

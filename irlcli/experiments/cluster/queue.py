@@ -69,3 +69,13 @@ def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
         if there is not None:
             found[name] = there
     return found
+
+
+def last_place(plan: Plan, store: Store) -> str | None:
+    """Where steps of the plan were submitted to last; None if they never were."""
+    identities = set(plan.identities.values())
+    for record in reversed(records(store)):
+        # A chosen lambda changes what a step is, and keeps its name.
+        if any(job.identity in identities or job.name in plan.tasks for job in record.jobs):
+            return record.place
+    return None

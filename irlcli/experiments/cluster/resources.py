@@ -26,9 +26,10 @@ class Resources(NamedTuple):
     extra: Mapping[str, str] = {}
 
     def words(self) -> list[str]:
-        """The options of srun for the same place."""
-        words = [f"--{name}={value}" for name, value in self.extra.items()]
-        return words if self.partition is None else [f"--partition={self.partition}", *words]
+        """The options of srun for the same place and size."""
+        words = [] if self.partition is None else [f"--partition={self.partition}"]
+        words.append(f"--cpus-per-task={self.cpus}")
+        return words + [f"--{name}={value}" for name, value in self.extra.items()]
 
 
 def parse_minutes(text: str) -> int:

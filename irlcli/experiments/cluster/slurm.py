@@ -152,7 +152,7 @@ class Slurm:
         token = f"probe-{os.urandom(8).hex()}"
         (store / ".jobs").mkdir(exist_ok=True)
         (store / ".jobs" / token).touch()
-        command = ["srun", "--ntasks=1", "--time=2", f"--job-name={JOB_NAME}-probe", "--quiet"]
+        command = ["srun", "--ntasks=1", "--time=2", f"--job-name={JOB_NAME}-probe"]
         command += [
             *self._resources.words(),
             sys.executable,
@@ -162,14 +162,17 @@ class Slurm:
         waiting()
         try:
             before = time.time()
-            done = _say(*command, str(store.resolve()), token, str(Path.cwd()))
+            printed, errors = _allocate(
+                [*command, str(store.resolve()), token, str(Path.cwd())],
+                lambda why: warn(f"Slurm does not start the probe job: {why}"),
+            )
             after = time.time()
         finally:
             (store / ".jobs" / token).unlink(missing_ok=True)
         try:
-            facts = json.loads(done.stdout.splitlines()[-1])
+            facts = json.loads(printed.splitlines()[-1])
         except (IndexError, ValueError):
-            raise _refused(done.stderr) from None
+            raise _refused(errors) from None
         where = f"the node {facts['host']}"
         if not facts["seen"]:
             raise StageFailed(
@@ -216,15 +219,41 @@ def _refused(errors: str) -> UsageError | StageFailed:
     )
 
 
+def _allocate(command: Sequence[str], explain: Callable[[str], None]) -> tuple[str, str]:
+    """What an srun printed, and its errors; ``explain`` is told why it waits, if srun says so."""
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env=_environment(),
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        errors: list[str] = []
+        for line in process.stderr:
+            if line.rstrip().endswith("queued and waiting for resources"):
+                if errors:
+                    explain(errors[-1].removeprefix("srun:").strip())
+            elif not line.rstrip().endswith("has been allocated resources"):
+                errors.append(line)
+        return process.stdout.read(), "".join(errors)
+
+
 def _say(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, capture_output=True, text=True, errors="replace", env=_environment()
+    )
+
+
+def _environment() -> dict[str, str]:
     # Inside an allocation srun would start a step there, which may wait for the shell that asks.
     # SQUEUE_STATES or SQUEUE_USERS would hide jobs, and their steps would be submitted again.
-    kept = {
+    return {
         name: value
         for name, value in os.environ.items()
         if not name.startswith(("SLURM_", "SQUEUE_")) or name in ("SLURM_CONF", "SLURM_CLUSTERS")
     }
-    return subprocess.run(command, capture_output=True, text=True, errors="replace", env=kept)
 
 
 def _reason(text: str) -> str:

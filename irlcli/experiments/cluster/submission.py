@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,7 +74,7 @@ class Submission:
         self._record: Record | None = None
         self._lost: set[str] = set()
         self._explained: set[str] = set()
-        self._stopped = False
+        self._signals = 0
         self._outcome = Outcome([], [], [], {}, [], False)
 
     def submit(self, waiting: Callable[[], None], warn: Callable[[str], None]) -> int:
@@ -113,7 +113,10 @@ class Submission:
         return len(new)
 
     def watch(self) -> Outcome:
-        """Wait until every job has ended, or a signal asks to stop; the jobs of Slurm go on.
+        """Wait until every job has ended, or a signal asks to stop.
+
+        The jobs of Slurm go on after a signal. Those of this machine stop at a checkpoint, and a
+        second signal ends the wait for that.
 
         Raises:
             StageFailed: the queue did not answer for ten minutes.
@@ -154,11 +157,22 @@ class Submission:
                     self._pause(time.monotonic() - started)
                 elif not self._any_ready():
                     break
-        if self._stopped and not self._queue.starts_what_waits:
-            self._queue.cancel(self._ids[name] for name in alive)
+            if self._stopped and not self._queue.starts_what_waits:
+                self._stop_jobs(alive, running)
         done = {*self._outcome.existed, *self._outcome.copied, *self._outcome.made}
         blocked = [n for n in self._plan.tasks if n not in done and n not in self._outcome.failed]
         return self._outcome._replace(blocked=blocked, interrupted=self._stopped)
+
+    def _stop_jobs(self, alive: set[str], running: Mapping[str, float]) -> None:
+        """Cancel jobs that nobody else starts again, and wait until they have ended."""
+        self._display.stopping("to leave without waiting")
+        ids = {self._ids[name] for name in alive}
+        self._queue.cancel(ids)
+        while self._signals < 2 and not ids.isdisjoint(self._queue.states()):
+            time.sleep(0.1)
+        self._plan.lookup.forget_missing()
+        for name in alive:
+            self._ended(name, last=False, since=running.get(name, time.monotonic()))
 
     def _find_queued(self, names: Sequence[str]) -> list[str]:
         """Note the jobs of steps that are in the queue; returns the other steps."""
@@ -278,5 +292,9 @@ class Submission:
         while time.monotonic() < limit and not self._stopped:
             time.sleep(0.1)
 
+    @property
+    def _stopped(self) -> bool:
+        return self._signals > 0
+
     def _stop(self) -> None:
-        self._stopped = True
+        self._signals += 1
