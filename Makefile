@@ -103,6 +103,7 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.airl --env half-cheetah --rounds 2
 	$(VENV)/bin/python -m benchmarks.penalties
 	$(VENV)/bin/python -m benchmarks.parallel
+	$(VENV)/bin/python -m benchmarks.growth
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
 	$(VENV)/bin/python -m benchmarks.workers

@@ -11,20 +11,21 @@ import argparse
 import resource
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import gymnasium
 import numpy as np
 import torch
 
-from irlcli.configs import load_config
+from irlcli.configs import AIRLConfig, load_config
 from irlcli.envs.registry import environment
 from irlcli.interventions import parse_settings
 from irlcli.learners.airl import AIRL
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
-from irlcli.rl.worlds import action_space, make_worlds
+from irlcli.rl.worlds import Worlds, action_space, make_worlds
+from irlcli.trajectories import Trajectory
 
 INTERVENTIONS = {
     "lunar-lander": "engine-power=1x,1.25x",
@@ -45,24 +46,10 @@ def main() -> None:
     settings = parse_settings(arguments.env, arguments.intervention or INTERVENTIONS[arguments.env])
 
     bare = make_worlds(arguments.env, settings, config.ppo.n_envs)
-    worlds = make_worlds(arguments.env, settings, config.ppo.n_envs)
     # Random demonstrations cost as much to learn from as an expert's.
     demos = [roll_out(arguments.env, s, "random", 10, 0, "bench") for s in settings]
-    trainer = PPOTrainer(worlds, config.ppo, config.total_steps, 0, "bench")
-    learner = AIRL(
-        demos,
-        config,
-        worlds=len(worlds),
-        rounds=trainer.rounds,
-        horizon=environment(arguments.env).max_episode_steps,
-        observation_size=worlds.observation_space.shape[0],
-        actions=action_space(worlds.action_space),
-        seed=0,
-    )
-
-    challengers = None
-    if config.challenger.life > 0:
-        challengers = Challengers(worlds, config.challenger, learner, 0, "bench")
+    worlds = make_worlds(arguments.env, settings, config.ppo.n_envs)
+    trainer, learner, challengers = build(arguments.env, worlds, demos, config)
 
     seconds: dict[str, float] = defaultdict(float)
     worlds.step = _timed(worlds.step, seconds, "environment")
@@ -111,6 +98,29 @@ def main() -> None:
         share = "" if part == "bare stepping" else f"{seconds[part] / seconds['AIRL in all']:.0%}"
         ratio = seconds[part] / seconds["bare stepping"]
         print(f"{part:28}{1e6 * seconds[part] / steps:20.1f}{share:>8}{ratio:8.2f}")
+
+
+def build(
+    env: str,
+    worlds: Worlds,
+    demos: Sequence[Sequence[Trajectory]],
+    config: AIRLConfig,
+) -> tuple[PPOTrainer, AIRL, Challengers | None]:
+    """Student, discriminator and challengers (if ``config`` has any) of a training in ``worlds``."""
+    trainer = PPOTrainer(worlds, config.ppo, config.total_steps, 0, "bench")
+    learner = AIRL(
+        demos,
+        config,
+        worlds=len(worlds),
+        rounds=trainer.rounds,
+        horizon=environment(env).max_episode_steps,
+        observation_size=worlds.observation_space.shape[0],
+        actions=action_space(worlds.action_space),
+        seed=0,
+    )
+    if config.challenger.life == 0:
+        return trainer, learner, None
+    return trainer, learner, Challengers(worlds, config.challenger, learner, 0, "bench")
 
 
 def _timed(function: Callable, seconds: dict[str, float], part: str) -> Callable:
