@@ -144,7 +144,20 @@ def knob_of(env: str, knob: str) -> Knob:
 
 def examples_of(knob: Knob) -> str:
     """A value in each form that ``knob`` allows: ``2x or 0.5``."""
+    if knob.whole:
+        return _format(next(x for x in (knob.high, knob.low, 1.0) if math.isfinite(x)))
     return " or ".join(_EXAMPLES[form] for form in knob.forms)
+
+
+def _allowed(knob: Knob) -> str:
+    """The range of a knob: ``must be 0 or 1``, ``must be 0, 1, 2 or 3``, ``must lie in 0.1 to 8``."""
+    low, high = _format(knob.low), _format(knob.high)
+    if not knob.whole:
+        return f"must lie in {low} to {high}"
+    if not knob.high - knob.low < 10:
+        return f"must be a whole number from {low} to {high}"
+    *others, last = [str(n) for n in range(int(knob.low), int(knob.high) + 1)]
+    return f"must be {', '.join(others)} or {last}" if others else f"must be {last}"
 
 
 def parse_value(env: str, knob: str, text: str) -> Value:
@@ -174,13 +187,13 @@ def parse_value(env: str, knob: str, text: str) -> Value:
         if spec.whole and not all(x.is_integer() for x in numbers):
             raise UsageError(
                 f"{knob}={text.strip()!r} is not a whole number",
-                f"{knob} ({spec.description}) is one of {_format(spec.low)} to {_format(spec.high)}",
+                f"{knob} ({spec.description}) {_allowed(spec)}",
             )
         for x in numbers:
             if not math.isfinite(x) or not spec.low <= x <= spec.high:
                 raise UsageError(
                     f"{knob}={text.strip()!r} is out of range",
-                    f"{knob} ({spec.description}) must lie in {_format(spec.low)} to {_format(spec.high)}",
+                    f"{knob} ({spec.description}) {_allowed(spec)}",
                 )
         return Value(form, numbers)
     raise UsageError(
@@ -205,9 +218,12 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
     knob_of(env, knob)
     for part in values.split(",")[1:]:
         if "=" in part:
+            other = part.partition("=")[0].strip()
+            knob_of(env, other)
             raise UsageError(
-                f"{part.strip()!r} is not a value of {knob}",
-                "a setting of several knobs: --setting KNOB=VALUE,KNOB=VALUE",
+                f"{text!r} gives values of two knobs, {knob} and {other}",
+                "to change both in one setting, write --setting "
+                f"{knob}={values.split(',')[0].strip()},{part.strip()}",
             )
     settings = [Setting(((knob, parse_value(env, knob, part)),)) for part in values.split(",")]
     check_distinct(repr(text), settings)

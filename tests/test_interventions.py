@@ -192,7 +192,7 @@ def test_numbers_beyond_floats_are_refused(form, text):
         ("engine-power=1x;2x", "'1x;2x'"),
         ("engine-power==1x", "'=1x'"),
         ("engine-power=1x=2x", "'1x=2x'"),
-        ("engine-power=1x,bounce=0.5", "'bounce=0.5'"),
+        ("engine-power=1x,bounce=0.5", "engine-power and bounce"),
         ("engine-power=1x,1x", "engine-power=1x"),
         ("engine-power=1x,1.0x", "engine-power=1x"),
         ("bounce=0,-0", "bounce=0"),
@@ -209,6 +209,19 @@ def test_malformed_settings_name_the_thing_and_hint(text, named):
     assert named in caught.value.message
     assert caught.value.hint
     assert "\n" not in caught.value.message + caught.value.hint
+
+
+def test_values_of_two_knobs_are_refused_and_the_hint_shows_the_setting_of_both():
+    with pytest.raises(UsageError, match="two knobs, plain and double") as caught:
+        parse_settings(WORLD, "plain=1, double=2x")
+    assert "--setting plain=1,double=2x" in caught.value.hint
+
+
+@pytest.mark.parametrize("value", ["0.5", "2", "yes"])
+def test_a_switch_that_is_not_0_or_1_is_refused_with_a_value_that_works(value):
+    with pytest.raises(UsageError, match=f"terminate-when-unhealthy='{value}'") as caught:
+        parse_settings("mujoco-hopper", f"terminate-when-unhealthy={value}")
+    assert "must be 0 or 1" in caught.value.hint or "=1" in caught.value.hint
 
 
 def test_settings_keep_their_order():
@@ -299,7 +312,8 @@ def test_a_setting_of_several_knobs_reads_back_in_any_order(numbers, data):
         ("plain=1,plain=2", "changes plain twice, by plain"),
         ("plain=1,double=", "not an intervention"),
         ("plain=1,other=2", "no intervention 'other'"),
-        ("plain=1,2,double=2x", "'double=2x' is not a value of plain"),
+        ("plain=1,2,double=2x", "values of two knobs, plain and double"),
+        ("plain=1,2,other=2x", "no intervention 'other'"),
         ("=1,plain=2", "not an intervention"),
         ("plain=1,default", "not an intervention value"),
     ],

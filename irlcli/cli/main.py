@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import re
 import signal
 import sys
 from typing import Any
@@ -77,6 +78,11 @@ def _usage(error: Any) -> UsageError:
     context = getattr(error, "ctx", None)
     path = context.command_path if context is not None else "irl"
     message = error.format_message().replace("\n", " ").rstrip(".")
+    message = re.sub("a valid int(eger)?( range)?$", "a whole number", message)
+    message = re.sub("a valid float( range)?$", "a number", message)
+    message = re.sub(
+        r"^Got unexpected extra argument.*? \((.*)\)$", r"Unexpected argument: \1", message
+    )
     return UsageError(message[0].lower() + message[1:], f"`{path} --help` lists the options")
 
 

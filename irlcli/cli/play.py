@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from irlcli.cli import console as out
-from irlcli.cli.options import Env, Seed, store_command
+from irlcli.cli.options import Env, OneSetting, Seed, store_command
 from irlcli.cli.session import Session
 from irlcli.configs import load_config
 from irlcli.errors import UsageError
@@ -34,6 +34,7 @@ def play(
             help="Further settings: VALUE,... of the policy's knob, KNOB=VALUE,... or KNOB."
         ),
     ] = None,
+    setting: OneSetting = [],  # noqa: B006
     reward: Annotated[
         str | None,
         typer.Option(
@@ -47,16 +48,18 @@ def play(
 ) -> None:
     """Draw a policy as a GIF or MP4, several settings side by side.
 
-    The settings are those it was trained in, then those of --ood.
+    The settings are those it was trained in, then those of --ood and --setting.
     """
     known = arguments.env_name(env)
     source, origin = references.tensor_file(session.store, policy, "policy")
     arguments.check_env(policy, origin.env, known)
     env = origin.env
     settings = [parse_setting(env, text) for text in origin.settings]
-    if ood is not None:
-        added = arguments.named_settings(env, load_config(env), ood, "ood", origin)
-        settings += [setting for setting in added if setting not in settings]
+    named = (
+        [] if ood is None else arguments.named_settings(env, load_config(env), ood, "ood", origin)
+    )
+    added = arguments.with_several(env, named, setting, origin)
+    settings += [one for one in added if one not in settings]
     if file.suffix.lower() not in (".gif", ".mp4"):
         raise UsageError(f"{str(file)!r} ends in neither .gif nor .mp4", "name such a file")
     if not file.parent.is_dir():

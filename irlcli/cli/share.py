@@ -83,7 +83,7 @@ def _chosen(store: "Place", refs: list[str] | None, everything: bool) -> list[Ar
     for ref in refs or ():
         artefact = store.resolve(ref).artefact
         if artefact is None:
-            raise NotFound(f"{ref!r} is a file outside the store {store.root}")
+            raise NotFound(f"{ref!r} is not an artefact of the store {store.root}")
         found[artefact.id] = artefact
     return list(found.values())
 

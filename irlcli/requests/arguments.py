@@ -1,5 +1,6 @@
 """Text of options as settings, counts and numbers."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -207,10 +208,23 @@ def seeds(text: str) -> tuple[int, ...]:
     try:
         numbers = tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--seeds {text!r} is not a list of seeds", "write 0,1,2,3,4") from None
+        raise UsageError(
+            f"--seeds {text!r} is not a list of seeds", f"write {_list_of(text)}"
+        ) from None
     if min(numbers) < 0:
         raise UsageError(f"--seeds {text!r} holds a negative seed", "seeds are 0 or more")
     return numbers
+
+
+def _list_of(text: str) -> str:
+    """The list that somebody meant who wrote ``0-2``, ``0..2`` or ``0:2``; otherwise an example."""
+    found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-|\.\.+|:)\s*(\d{1,9})\s*", text)
+    if not found or int(found[1]) >= int(found[2]):
+        return "0,1,2,3,4"
+    first, last = int(found[1]), int(found[2])
+    if last - first < 10:
+        return ",".join(str(seed) for seed in range(first, last + 1))
+    return f"{first},{first + 1}, and so on to {last}"
 
 
 def weights(text: str) -> list[float] | Literal["own"]:

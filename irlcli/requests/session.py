@@ -1,12 +1,13 @@
 """What options are read and requests are run with: a store, configs, and a console."""
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from irlcli.errors import NotFound
+from irlcli.errors import NotFound, UsageError
 from irlcli.store import Artefact, Store
 
 DEFAULT_STORE, DEFAULT_PROFILE = Path("runs"), "standard"
@@ -26,9 +27,18 @@ class Session:
             and the lines of ``say(text)``.
         wait: wait for other processes, instead of raising Busy.
         read_only: nothing is written to the store.
+
+    Raises:
+        UsageError: ``store`` is a URL.
     """
 
     def __init__(self, store: Path, console: Any, wait: bool = True, read_only: bool = False):
+        # As a path it would be a directory here: a path has no empty parts, so `//` became `/`.
+        if re.match(r"[A-Za-z][\w+.-]+:/", str(store)):
+            raise UsageError(
+                f"the store {store} is a URL, not a directory",
+                "--from reads a store behind a URL; `irl push` and `irl pull` copy artefacts",
+            )
         self.console = console
         self.store = Store(store, console.warn, read_only)
         self.wait = wait
@@ -41,11 +51,15 @@ class Session:
         """The artefact that ``ref`` names.
 
         Raises:
-            NotFound: no such artefact, or a file outside the store.
+            NotFound: no such artefact, or a path outside the store.
         """
         resolved = self.store.resolve(ref)
         if resolved.artefact is None:
-            raise NotFound(f"{ref!r} is a file outside the store", "`irl ls` lists the artefacts")
+            kind = "directory" if resolved.path.is_dir() else "file"
+            raise NotFound(
+                f"{ref!r} is a {kind}, not an artefact of the store {self.store.root}",
+                "`irl ls` lists the artefacts",
+            )
         return resolved.artefact
 
     def name(self, name: str, artefact: Artefact) -> None:

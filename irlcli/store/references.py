@@ -1,6 +1,8 @@
 """What a user may write to refer to an artefact: a path, a name, or an id prefix."""
 
 import os
+import re
+import shlex
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,13 +58,30 @@ def resolve(layout: Layout, ref: str) -> Resolved:
             text = below
             found = _inside(layout, text)
     if found is None:
-        close = closest(text.partition("/")[0], names(layout))
-        suggestion = f"did you mean {close!r}? " if close is not None else ""
-        raise NotFound(
-            f"{ref!r} names no artefact and no file",
-            f"{suggestion}`irl ls` lists the artefacts",
-        )
+        raise _unknown(layout, ref, text)
     return found
+
+
+def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
+    """Why ``ref`` names nothing; ``text`` is what it would be inside the store."""
+    if not layout.root.exists():
+        return NotFound(
+            f"{ref!r} names no file, and there is no store at {layout.root}",
+            "name another store with --store or IRL_STORE",
+        )
+    from irlcli.store.integrity import quarantined
+
+    head = text.partition("/")[0]
+    if is_prefix(head) and quarantined(layout, head) is not None:
+        return _missing(layout, f"artefact {head}", head)
+    known = "" if str(layout.root) == DEFAULT_ROOT else f" --store {shlex.quote(str(layout.root))}"
+    listing = f"`irl ls{known}` lists the artefacts"
+    close = closest(head, names(layout))
+    if close is not None:
+        listing = f"did you mean {close!r}? {listing}"
+    elif re.fullmatch("[0-9a-f]{1,2}", text):
+        listing = f"write at least 3 digits of an id; {listing}"
+    return NotFound(f"{ref!r} names no artefact and no file", listing)
 
 
 def _inside(layout: Layout, text: str) -> Resolved | None:
@@ -85,22 +104,22 @@ def _by_name(layout: Layout, name: str) -> Artefact | None:
     if id16 is None:
         return None
     if not (layout.root / id16).is_dir():
-        raise _missing(layout, name, id16)
+        raise _missing(layout, f"the name {name!r} points to {id16}, which", id16)
     return get(layout, id16)
 
 
-def _missing(layout: Layout, name: str, id16: str) -> NotFound:
+def _missing(layout: Layout, subject: str, id16: str) -> NotFound:
     from irlcli.store.integrity import quarantined
 
     place = quarantined(layout, id16)
     if place is None:
         return NotFound(
-            f"the name {name!r} points to {id16}, which is missing",
+            f"{subject} is missing",
             "name another artefact with `irl name`",
         )
     command = recorded_command(place)
     return NotFound(
-        f"the name {name!r} points to {id16}, which was damaged and is now in {place}",
+        f"{subject} was damaged and is now in {place}",
         f"compute it again: {command}" if command else "compute it again",
     )
 

@@ -58,6 +58,51 @@ def test_a_bounded_field_names_its_bounds(irl, smoke_store, item, hint):
     assert done.code == 2 and done.err.splitlines()[-1] == f"hint: {hint}"
 
 
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("0-2", "write 0,1,2"),
+        ("3..5", "write 3,4,5"),
+        ("0:40", "write 0,1, and so on to 40"),
+        ("2-0", "write 0,1,2,3,4"),
+        ("all", "write 0,1,2,3,4"),
+    ],
+)
+def test_a_range_of_seeds_is_written_as_a_list(irl, tmp_path, text, hint):
+    done = irl("plan", "table1", "--seeds", text, *SMOKE, "--store", tmp_path)
+    assert done.code == 2 and done.err.splitlines()[-1] == f"hint: {hint}"
+
+
+def test_a_reference_is_not_looked_up_in_a_store_that_does_not_exist(irl, tmp_path):
+    done = irl("show", "airl", "--store", tmp_path / "rnus")
+    assert done.code == 3 and f"no store at {tmp_path / 'rnus'}" in done.err
+
+
+def test_a_url_is_not_taken_for_a_directory(irl, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = ["evaluate", "--idle", "--env", "lunar-lander", *SMOKE, "--store", "s3://bucket/runs"]
+    done = irl(*line)
+    assert done.code == 2 and "a URL" in done.err and "--from" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_reference_may_be_is_in_the_hint(irl, store_copy):
+    store = store_copy.path
+
+    def hint(ref):
+        return irl("show", ref, "--store", store).err.splitlines()[-1]
+
+    assert f"`irl ls --store {store}` lists" in hint("nothing")
+    assert "did you mean 'airl'" in hint("air1")
+    assert "at least 3 digits" in hint(store_copy.airl[:2])
+    manifest = store / store_copy.airl / "manifest.json"
+    manifest.chmod(0o644)
+    manifest.write_text("{")
+    # The first command moves it to quarantine, the second finds it there.
+    assert hint(store_copy.airl) == hint(store_copy.airl)
+    assert "irl train-airl" in hint(store_copy.airl)
+
+
 def session(store, profile="standard", overrides=()):
     fixed = {"file": None, "sources": (), "dry_run": True, "wait": True, "workers": 1}
     return StageSession(

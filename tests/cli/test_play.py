@@ -91,7 +91,7 @@ def test_the_returns_drawn_are_those_of_the_episode(irl, smoke_store, tmp_path, 
 @pytest.mark.parametrize(
     ("policy", "words", "method"),
     [
-        ("airl", [], "irm"),
+        ("airl", ["--setting", "engine-power=1.5x,friction=0.5"], "irm"),
         ("moved", [], "irm"),
         ("moved", ["--reward", "airl"], "irm"),
         ("EXPERT", [], None),
