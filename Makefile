@@ -2,7 +2,7 @@
 # make test       the tests              make lint   ruff and mypy
 # make table1     a table of the paper: missing experts, rewards, retrained policies and returns are
 #                 made, then the report. Also figure2 figure3 figure4 table2 experts gates
-#                 retraining control mujoco all-results.
+#                 retraining control control-airl control-airl-5 table1-5 mujoco all-results.
 #                 `make table1.rewards` stops after a phase: experts, rewards, transfers or returns.
 # make report-table1      a report on what exists; runs nothing
 # make bench torture clean help
@@ -43,7 +43,7 @@ OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --clu
 .SECONDARY:
 
 help:
-	@sed -n 's/^# \{0,1\}//p; /^$$/q' Makefile
+	@sed -n '/^$$/q; s/^# \{0,1\}//p' Makefile
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

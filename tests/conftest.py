@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import io
 import json
 import os
@@ -78,6 +79,8 @@ def run_main(arguments: list[str]) -> Result:
         code = stop.code or 0
     finally:
         sys.argv = before
+        # The command line disables it: it makes little garbage before it ends.
+        gc.enable()
         # The command line ignores it from its last message on; here the process lives on.
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return Result(code, out.getvalue(), err.getvalue())

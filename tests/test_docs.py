@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,21 @@ def test_every_make_target_shown_exists(page: Path) -> None:
         words = [word for word in shlex.split(text, comments=True) if "=" not in word]
         for word in words[1:] if words[:1] == ["make"] else []:
             assert any(fnmatch.fnmatch(word, target) for target in targets), text
+
+
+def test_make_help_names_every_target_and_variable() -> None:
+    done = subprocess.run(["make", "help"], cwd=CHECKOUT, capture_output=True, text=True)
+    words = set(re.findall(r"[\w-]+", done.stdout))
+    assert {target for target in make_targets() if "*" not in target} <= words
+    assert {"PROFILE", "CLUSTER", "RESULTS"} <= words
+
+
+def test_every_table_has_a_make_target_and_is_in_the_docs() -> None:
+    tables = tomllib.loads((CHECKOUT / "settings" / "experiments.toml").read_text())
+    names = tables.keys() - {"defaults"}
+    assert names <= set(make_targets())
+    page = (CHECKOUT / "docs" / "command-line.md").read_text()
+    assert [name for name in names if f"`{name}`" not in page] == []
 
 
 @pytest.mark.parametrize("name", ["python-api.md", "environments.md"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import subprocess
 import sys
@@ -244,6 +245,21 @@ def test_closing_twice_is_harmless(env):
     env.reset(seed=0)
     env.close()
     env.close()
+
+
+def test_a_world_that_nobody_closed_is_closed_when_it_is_dropped():
+    """Bullet keeps the 28 MiB of a client until it is told to disconnect."""
+
+    def connected() -> set[int]:
+        gc.collect()
+        return {client for client in range(100) if pybullet.isConnected(client)}
+
+    before = connected()
+    env = Ant()
+    env.reset(seed=0)
+    assert len(connected()) == len(before) + 1
+    del env
+    assert connected() == before
 
 
 def test_resets_do_not_leak_memory():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import weakref
 
 import numpy as np
 import pybullet_data
@@ -62,6 +63,9 @@ class World:
             )
         mode = pybullet.GUI if render_mode == "human" else pybullet.DIRECT
         self.client: int = pybullet.connect(mode)
+        # A client has 28 MiB, which Bullet keeps until it is told to disconnect.
+        self._disconnect = weakref.finalize(self, pybullet.disconnect, self.client)
+        self._disconnect.atexit = False
         self._gravity = gravity
         self._substeps = substeps
         self._ground = ground
@@ -121,6 +125,5 @@ class World:
 
     def close(self) -> None:
         """Disconnect from Bullet; a second call does nothing."""
-        if self.client >= 0:
-            pybullet.disconnect(self.client)
-            self.client = -1
+        self._disconnect()
+        self.client = -1

@@ -1,0 +1,206 @@
+"""Push and pull where something is wrong: damage, hostile files, places that cannot be used."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import threading
+from functools import partial
+
+import fsspec
+import pytest
+from places import at, files_of, memory, other, pull, push
+
+from irlcli.errors import IntegrityError, StageFailed
+from irlcli.store import Artefact, Store
+from irlcli.store import remote as remotes
+from irlcli.store.remote import Remote
+
+# What is damaged or missing
+
+
+def flip(path: str) -> None:
+    data = memory().cat_file(path)
+    memory().pipe_file(path, data[:-1] + bytes([data[-1] ^ 1]))
+
+
+def longer(path: str) -> None:
+    memory().pipe_file(path, memory().cat_file(path) + b"!")
+
+
+def emptied(path: str) -> None:
+    memory().pipe_file(path, b"")
+
+
+@pytest.mark.parametrize("name", ["f", "nested/g", "manifest.json", "provenance.json"])
+@pytest.mark.parametrize("damage", [flip, longer, emptied])
+@pytest.mark.parametrize("which", ["expert", "airl"])
+def test_damage_there_is_named_and_not_published(
+    irl, store, chain, url, tmp_path, name, damage, which
+):
+    push(store, url, chain["airl"])
+    damage(at(url, chain[which], name))
+    result = irl("pull", chain["airl"].id, "--from", url, "--store", tmp_path / "other")
+    assert result.code == 4 and f"{url}/{chain[which].id}/{name}" in result.err, result.err
+    theirs = other(tmp_path)
+    assert not {chain[which].id, chain["airl"].id} & set(theirs.ids())
+    assert theirs.verify(theirs.ids()) == {}
+    # A push repairs what it can see: the size of what the manifest lists, and of the manifest.
+    if damage is not flip and name != "provenance.json":
+        push(store, url, chain["airl"])
+        assert len(pull(url, theirs, "irm-0").copied) > 0
+        assert set(theirs.ids()) == {a.id for a in chain.values()}
+
+
+def test_a_damaged_artefact_here_is_not_pushed(irl, store, chain, url):
+    path = chain["demos"].directory / "f"
+    path.chmod(0o644)
+    path.write_bytes(b"DEMOS")
+    result = irl("push", "irm-0", "--to", url, "--store", store.root)
+    assert result.code == 4 and str(path) in result.err
+    assert list(Remote(url, pytest.fail).index().artefacts) == [chain["expert"].id]
+
+
+def test_a_damaged_artefact_here_replaces_nothing_there(store, chain, url):
+    push(store, url, chain["expert"])
+    memory().rm(at(url, chain["expert"], "nested/g"))
+    path = chain["expert"].directory / "f"
+    path.chmod(0o644)
+    path.write_bytes(b"EXPERT")
+    with pytest.raises(IntegrityError, match="differs"):
+        push(store, url, chain["expert"])
+    assert memory().cat_file(at(url, chain["expert"], "f")) == b"expert"
+
+
+def test_what_changes_on_the_way_is_not_visible(store, chain, url, monkeypatch):
+    monkeypatch.setattr(remotes.Remote, "read", lambda *_: iter([b"other"]))
+    with pytest.raises(IntegrityError, match="differs"):
+        push(store, url, chain["expert"])
+    assert Remote(url, pytest.fail).index().artefacts == {}
+
+
+@pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
+def test_a_missing_ancestor_is_named(store, chain, place, tmp_path):
+    push(store, place, chain["airl"])
+    fsspec.core.url_to_fs(place)[0].rm(f"{place}/{chain['demos'].id}", recursive=True)
+    warnings: list[str] = []
+    pull(place, other(tmp_path), "irm-0", warnings.append)
+    assert other(tmp_path).ids() == [chain["airl"].id]
+    lost = f"{chain['demos'].id} is missing in {place}: {chain['airl'].id} was made from it"
+    assert warnings == [lost]
+
+
+# Hostile places
+
+
+def planted(url: str, artefact: Artefact, **changes: object) -> None:
+    path = at(url, artefact, "manifest.json")
+    value = {**json.loads(memory().cat_file(path)), **changes}
+    memory().pipe_file(path, json.dumps(value, sort_keys=True, indent=1).encode() + b"\n")
+
+
+@pytest.mark.parametrize("path", ["../../evil", "/tmp/evil", "a/../../b", "manifest.json", "x\x1b"])
+def test_no_path_leads_out_of_an_artefact(irl, store, chain, url, tmp_path, path):
+    push(store, url, chain["expert"])
+    planted(url, chain["expert"], outputs=[{"path": path, "size": 1, "sha256": "0" * 64}])
+    result = irl("pull", chain["expert"].id, "--from", url, "--store", tmp_path / "new" / "runs")
+    assert result.code == 4 and f"{url}/{chain['expert'].id}/manifest.json" in result.err
+    assert not (tmp_path / "new").exists()
+
+
+def test_only_outputs_are_taken(store, chain, url, tmp_path):
+    """No checkpoint, no unlisted file, no odd name, no pointer to another place."""
+    push(store, url, chain["expert"])
+    root, key = f"/{url.removeprefix('memory://')}", chain["expert"].manifest.record.key
+    for name in (f".work/{key}/checkpoint", f"{chain['expert'].id}/code.py", "0" * 15 + "g/x"):
+        memory().pipe_file(f"{root}/{name}", b"cos\nsystem\n(S'touch evil'\ntR.")
+    for name, text in {
+        "ok": "../../x",
+        "a b": chain["expert"].id,
+        "abc": chain["expert"].id,
+    }.items():
+        memory().pipe_file(f"{root}/.names/{name}", text.encode())
+    memory().pipe_file(f"{root}/.keys/{'0' * 64}", chain["expert"].id.encode())
+    theirs = other(tmp_path)
+    assert Remote(url, pytest.fail).peek("0" * 64) == (None, None)
+    pull(url, theirs, chain["expert"].id)
+    assert files_of(theirs.get(chain["expert"].id)) == files_of(chain["expert"])
+    assert theirs.ids() == [chain["expert"].id] and theirs.names() == {}
+    assert not theirs.has_checkpoint(key)
+
+
+# Places that cannot be used
+
+
+@pytest.mark.parametrize(
+    ("place", "code", "words"),
+    [
+        ("nope://bucket/x", 2, "'nope' is unknown"),
+        ("memory://nothing-here", 3, "is not a store"),
+        ("zoo-of-nobody", 3, "is not a store"),
+        ("", 2, "--from"),
+    ],
+)
+def test_a_place_that_is_no_store(irl, tmp_path, place, code, words):
+    result = irl("pull", "irm-0", "--from", place, "--store", tmp_path / "runs")
+    error, hint = result.err.splitlines()
+    assert result.code == code and words in error and hint.startswith("hint: ")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_bucket_that_cannot_be_used(irl, store, chain, bucket, monkeypatch):
+    def said(place: str) -> tuple[int, str]:
+        result = irl("push", "irm-0", "--to", place, "--store", store.root)
+        error, hint = result.err.splitlines()[-2:]
+        assert hint.startswith("hint: ")
+        return result.code, error
+
+    code, error = said("s3://nobody/x")
+    assert code == 3 and "bucket does not exist" in error
+    code, error = said("s3://Not%valid/x")
+    assert code == 2 and "not a valid URL" in error
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
+    code, error = said(bucket)
+    assert code == 2 and "no credentials" in error
+
+
+def test_files_that_are_no_store_are_left_alone(irl, store, chain, url):
+    memory().pipe_file(f"/{url.removeprefix('memory://')}/thesis.tex", b"x")
+    result = irl("push", "irm-0", "--to", url, "--store", store.root)
+    assert result.code == 4 and "not a store" in result.err
+    assert result.err.endswith("hint: name a store, or an empty or new place\n")
+    assert memory().ls(f"/{url.removeprefix('memory://')}", detail=False)[1:] == []
+
+
+def test_an_empty_folder_of_a_bucket_can_be_pushed_to(store, chain, bucket):
+    """Consoles make one as an object whose name ends in a slash."""
+    fsspec.filesystem("s3").call_s3("put_object", Bucket=bucket[5:], Key="lab/", Body=b"")
+    assert len(push(store, f"{bucket}/lab", chain["airl"]).copied) == 3
+
+
+def test_a_web_server_needs_ranges_for_large_files(store, chain, tmp_path, monkeypatch):
+    pytest.importorskip("aiohttp")
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(Quiet, directory=str(store.root))
+    )
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = f"http://127.0.0.1:{server.server_port}"
+    assert len(pull(url, other(tmp_path), "demos").copied) == 2
+    monkeypatch.setattr(remotes, "_CHUNK", 3)
+    with pytest.raises(StageFailed, match="range"):
+        pull(url, Store(tmp_path / "third", pytest.fail), "demos")
+    server.shutdown()
+    server.server_close()
+
+
+def test_an_unknown_reference_names_the_place(irl, store, chain, url, tmp_path):
+    push(store, url, chain["airl"])
+    result = irl("pull", "imr-0", "--from", url, "--store", tmp_path / "new")
+    assert result.code == 3 and url in result.err and f"irl ls --from {url}" in result.err
