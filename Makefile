@@ -2,7 +2,8 @@
 # make test       the tests              make lint   ruff and mypy
 # make table1     a table of the paper: missing experts, rewards, retrained policies and returns are
 #                 made, then the report. Also figure2 figure3 figure4 table2 experts gates
-#                 retraining control control-airl control-airl-5 table1-5 mujoco all-results.
+#                 retraining control control-airl control-airl-5 table1-5 mujoco mujoco-gates
+#                 all-results.
 #                 `make table1.rewards` stops after a phase: experts, rewards, transfers or returns.
 # make report-table1      a report on what exists; runs nothing
 # make bench torture clean help
@@ -38,7 +39,7 @@ OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --clu
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
 
 .PHONY: help demo test test-cluster lint bench torture all-results experts table1 table2 figure2 figure3 figure4
-.PHONY: control control-airl control-airl-5 table1-5 gates retraining mujoco clean
+.PHONY: control control-airl control-airl-5 table1-5 gates retraining mujoco mujoco-gates clean
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -72,7 +73,7 @@ demo: $(READY)
 
 all-results: experts table1 figure2 figure3 figure4 table2
 
-table1 table1-5 figure3 figure4 gates retraining mujoco control-airl control-airl-5: %: %.returns
+table1 table1-5 figure3 figure4 gates retraining mujoco mujoco-gates control-airl control-airl-5: %: %.returns
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 %.returns: %.transfers
 	$(IRL) run $* $(OPTIONS) --until returns

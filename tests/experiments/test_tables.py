@@ -45,6 +45,7 @@ def test_the_shipped_tables_are_the_papers():
         "table1-5",
         "demo",
         "mujoco",
+        "mujoco-gates",
         "experts",
         "control",
     }
@@ -63,6 +64,8 @@ def test_the_shipped_tables_are_the_papers():
     assert tables["table1"].measures == ("transfer", "from-student", "zero-shot", "id")
     assert tables["mujoco"].methods == tables["table1"].methods
     assert tables["mujoco"].seeds == (0, 1, 2) and len(rows["mujoco"]) == 5
+    assert set(rows["mujoco-gates"]) <= set(rows["mujoco"])
+    assert tables["mujoco-gates"].measures == tables["gates"].measures
     assert (tables["demo"].methods, tables["demo"].seeds) == (("erm", "irm"), (0,))
     assert tables["demo"].settings.name == "lunar-lander.toml"
 
