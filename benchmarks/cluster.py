@@ -14,17 +14,19 @@ import os
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.sharing import IRL, report
 from irlcli.configs import load_config
+from irlcli.experiments import provenance
 from irlcli.experiments.cluster.arrays import job_arrays
 from irlcli.experiments.cluster.records import Submitted, new_record
 from irlcli.experiments.plan import Plan, Selection
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import load_table
 from irlcli.stages.base import From
-from irlcli.store import Manifest, Output, Store
+from irlcli.store import KeyRecord, Manifest, Output, Store
 from irlcli.store.claim import HEARTBEAT_SECONDS, live_reader, read
 from irlcli.store.manifest import encode_provenance
 
@@ -34,6 +36,9 @@ ROWS = ("lunar-lander.engine-power", "lunar-lander.bounce")
 NODES = 200
 # The lock of the step, the reader's file, and the lock that an output is published under.
 CLAIMS = 3
+ATTEMPT = provenance.Attempt(
+    started="2026-01-01T00:00:00Z", seconds=1.0, commit="0" * 40, dirty=None
+)
 
 
 def main() -> None:
@@ -104,24 +109,37 @@ def fill(plan: Plan, store: Store) -> None:
         for source in task.request.inputs.values():
             if isinstance(source, From) and source.output is not None:
                 read_later[id(source.request)].add(source.output)
+        for learned in task.curves.values():
+            read_later[id(learned)].add("metrics.parquet")
     started = time.monotonic()
     for name, task in plan.tasks.items():
-        record = plan.lookup.record(task.request)
-        data = record.key.encode()
-        output_digest = hashlib.sha256(data).hexdigest()
         paths = read_later[id(task.request)] or {"summary.json"}
-        outputs = [Output(path, len(data), output_digest) for path in sorted(paths)]
-        manifest = Manifest(record, tuple(outputs))
-        directory = store.root / manifest.id[:16]
-        directory.mkdir()
-        for output in outputs:
-            (directory / output.path).write_bytes(data)
-        (directory / "provenance.json").write_bytes(encode_provenance(manifest.id, {}))
-        (directory / "manifest.json").write_bytes(manifest.encode())
-        (store.root / ".keys" / record.key).write_text(manifest.id[:16])
-        (store.root / ".names" / name).write_text(manifest.id[:16])
-        (store.root / ".locks" / record.key).touch()
+        write_artefact(store, name, plan.lookup.record(task.request), dict.fromkeys(paths))
     print(f"wrote {len(plan.tasks):,} artefacts in {time.monotonic() - started:.0f} s")
+
+
+def write_artefact(
+    store: Store, name: str, record: KeyRecord, files: Mapping[str, bytes | None]
+) -> None:
+    """Write an artefact without running its stage. A file without content gets the key's."""
+    contents = {path: data or record.key.encode() for path, data in sorted(files.items())}
+    manifest = Manifest(
+        record,
+        tuple(
+            Output(path, len(data), hashlib.sha256(data).hexdigest())
+            for path, data in contents.items()
+        ),
+    )
+    directory = store.root / manifest.id[:16]
+    directory.mkdir()
+    for path, data in contents.items():
+        (directory / path).write_bytes(data)
+    origin = provenance.record(["irl", record.stage], 1, (ATTEMPT,))
+    (directory / "provenance.json").write_bytes(encode_provenance(manifest.id, origin))
+    (directory / "manifest.json").write_bytes(manifest.encode())
+    (store.root / ".keys" / record.key).write_text(manifest.id[:16])
+    (store.root / ".names" / name).write_text(manifest.id[:16])
+    (store.root / ".locks" / record.key).touch()
 
 
 def claims(store: Store) -> None:

@@ -64,6 +64,8 @@ def budget(parameters: Mapping[str, Any]) -> str:
     for section, field, unit in _BUDGETS:
         config = parameters.get(section) if section else parameters
         found = config.get(field) if isinstance(config, dict) else None
+        if found is None:
+            continue
         counts = found if isinstance(found, list | tuple) else [found]
         if counts and all(isinstance(count, int) for count in counts):
             return _joined([", ".join(f"{count:,}" for count in counts), unit])
@@ -129,4 +131,6 @@ def _number(value: Any) -> str:
 
 def _joined(parts: Sequence[Any]) -> str:
     text = " ".join(str(part) for part in parts if part and part != "policy")
-    return "".join(c if c.isprintable() else "?" for c in text)[:_MAX_LENGTH]
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else "?" for c in text)
+    return text[:_MAX_LENGTH]

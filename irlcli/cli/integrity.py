@@ -10,6 +10,7 @@ from irlcli.cli.cluster import ended_submissions
 from irlcli.cli.options import collecting_command, store_command
 from irlcli.cli.session import Session
 from irlcli.errors import IntegrityError, UsageError
+from irlcli.store import Index
 
 _DAY = 86400.0
 
@@ -31,7 +32,7 @@ def verify(
         ids = session.store.ids()
     else:
         ids = [session.artefact(ref).id]
-    found = session.store.verify(ids, quick)
+    found, index = session.store.verify_all(ids, quick)
     newer = [id16 for id16, damage in found.items() if damage.newer]
     damaged = {id16: damage for id16, damage in found.items() if not damage.newer}
     for id16 in newer:
@@ -64,16 +65,16 @@ def verify(
             result,
         )
     if ref is None:
-        _check_missing(session, result)
+        _check_missing(session, index, result)
     if session.as_json:
         out.print_json("verify", result)
     else:
         out.print_data(f"{_count(checked, 'artefact')} verified")
 
 
-def _check_missing(session: Session, result: dict[str, Any]) -> None:
+def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> None:
     """Fail if a name points to nothing; warn if only an ancestor of a named artefact is missing."""
-    missing = session.store.missing(session.store.index(name_newer=False))
+    missing = session.store.missing(index)
     result["missing"] = {
         id16: {"names": lost.names, "made": lost.made, "command": lost.command or None}
         for id16, lost in missing.items()

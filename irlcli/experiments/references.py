@@ -10,15 +10,17 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.introduce import introduce
 from irlcli.experiments.runner import source_of
 from irlcli.stages.base import Source
-from irlcli.stages.import_demonstrations import Form
 from irlcli.store import Artefact, Index, Resolved, Store, read_json
+
+if TYPE_CHECKING:
+    from irlcli.stages.import_demonstrations import Form
 
 
 @overload
@@ -238,9 +240,18 @@ def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluatio
     artefact = store.resolve(ref).artefact
     if artefact is None or artefact.manifest.record.stage != "evaluate":
         raise UsageError(f"{ref!r} is not an evaluation", "name artefacts of `irl evaluate`")
+    return artefact, summary(store, artefact)
+
+
+def summary(store: Store, artefact: Artefact) -> descriptions.Evaluation:
+    """The summary of an evaluation.
+
+    Raises:
+        IntegrityError: damaged.
+    """
     introduce(artefact)
     path = store.open(artefact, _only(artefact, "summary.json"))
-    return artefact, descriptions.parse(read_json(path), descriptions.Evaluation, path)
+    return descriptions.parse(read_json(path), descriptions.Evaluation, path)
 
 
 def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:

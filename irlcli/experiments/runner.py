@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed
-from irlcli.experiments import provenance
-from irlcli.experiments.checkpoints import StageCheckpoints
 from irlcli.experiments.introduce import described
 from irlcli.experiments.status import Lookup, Step, key_record, source_in, source_of
 from irlcli.stages.base import Console, From, Job, Request, Source
@@ -200,6 +198,10 @@ class Runner:
     def _compute(
         self, request: Request, record: KeyRecord, sources: Mapping[str, Source], scratch: Any
     ) -> Artefact:
+        # Imported here: a hit needs neither.
+        from irlcli.experiments import provenance
+        from irlcli.experiments.checkpoints import StageCheckpoints
+
         inputs = {role: self._checked(source) for role, source in sources.items()}
         checkpoints = StageCheckpoints(
             request.stage, scratch, self.console, self.checkpoint_seconds

@@ -122,7 +122,7 @@ def measured(session: Session, artefact: Artefact) -> tuple[Evaluation, dict[str
     """An evaluation for :func:`irlcli.report.returns.rows`."""
     scored = "reward" in artefact.manifest.record.inputs
     own = scored and references.by_own_reward(artefact, session.store.index())
-    return references.evaluation(session.store, artefact.id)[1], {}, own
+    return references.summary(session.store, artefact), {}, own
 
 
 def _of_policy(

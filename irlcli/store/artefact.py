@@ -1,7 +1,8 @@
 """A published artefact: its directory, its manifest, and checks that change nothing."""
 
+import os
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,13 +74,16 @@ def read_artefact(directory: Path) -> Artefact:
 
 def output_problem(directory: Path, output: Output, quick: bool = False) -> str | None:
     """Why a file is not the published output; None if it is. ``quick`` compares sizes only."""
-    path = directory / output.path
+    path = f"{directory}/{output.path}"
     try:
-        information = path.lstat()
+        information = os.lstat(path)
         if not stat.S_ISREG(information.st_mode):
             return f"{path} is not a plain file"
-        if any((directory / part).is_symlink() for part in Path(output.path).parents):
-            return f"{path} is reached through a symbolic link"
+        way = path
+        while way != str(directory):
+            way = way.rpartition("/")[0]
+            if os.path.islink(way):
+                return f"{path} is reached through a symbolic link"
         if information.st_size != output.size:
             return f"{path} has {information.st_size} bytes instead of {output.size}"
         if not quick and file_digest(path) != output.sha256:
@@ -89,9 +93,18 @@ def output_problem(directory: Path, output: Output, quick: bool = False) -> str 
     return None
 
 
-def entries(directory: Path) -> list[Path]:
-    """All paths below ``directory`` except plain directories."""
-    return [p for p in directory.rglob("*") if p.is_symlink() or not p.is_dir()]
+def entries(directory: Path | str) -> Iterator[str]:
+    """All paths below ``directory`` except plain directories.
+
+    Raises:
+        OSError: a directory cannot be listed.
+    """
+    with os.scandir(directory) as listed:
+        for entry in listed:
+            if entry.is_dir(follow_symlinks=False):
+                yield from entries(entry.path)
+            else:
+                yield entry.path
 
 
 def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[str]:

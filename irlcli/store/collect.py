@@ -66,19 +66,22 @@ def missing(layout: Layout, index: Index) -> dict[str, Missing]:
     present = index.artefacts.keys() | index.newer.keys()
     found: dict[str, Missing] = {}
 
+    def is_there(id16: str) -> bool:
+        return id16 in present or (layout.root / id16).is_dir()
+
     def lost(id16: str) -> Missing:
         place = quarantined(layout, id16)
         command = "" if place is None else recorded_command(place)
         return found.setdefault(id16, Missing([], [], place, command))
 
     for name, id16 in pointers.items():
-        if id16 not in present and not (layout.root / id16).is_dir():
+        if not is_there(id16):
             lost(id16).names.append(name)
     for id16 in sorted(index.reached_from(pointers.values())):
         artefact = index.artefacts[id16]
         roles = [role for role, holders in index.parents(artefact).items() if not holders]
         for source in _stored_inputs(artefact, roles):
-            if source not in present:
+            if not is_there(source):
                 lost(source).made.append(id16)
     return found
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 _CHUNK = 1 << 20
+_DIGITS = frozenset("0123456789abcdef")
 
 
 def canonical_json(value: Any) -> bytes:
@@ -48,7 +49,12 @@ def digest(value: Any) -> str:
     return hashlib.sha256(canonical_json(value)).hexdigest()
 
 
-def file_digest(path: Path) -> str:
+def is_hexadecimal(text: str) -> bool:
+    """Whether ``text`` has only the digits of digests. Cheaper than compiling an expression."""
+    return _DIGITS.issuperset(text)
+
+
+def file_digest(path: Path | str) -> str:
     """sha256 of a file's bytes, read in chunks.
 
     Raises:

@@ -14,7 +14,7 @@ def fsync_file(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def fsync_directory(path: Path) -> None:
+def fsync_directory(path: Path | str) -> None:
     """Make the names in a directory durable."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -21,11 +22,16 @@ class Index:
     def __init__(self, artefacts: Mapping[str, Artefact], newer: Mapping[str, bytes]):
         self.artefacts = dict(artefacts)
         self.newer = dict(newer)
-        self._holders: dict[str, list[str]] = {}
+
+    @cached_property
+    def _holders(self) -> dict[str, list[str]]:
+        """The ids of the artefacts with an output, or all outputs together, of each content."""
+        found: dict[str, list[str]] = {}
         for artefact in self.artefacts.values():
             contents = {o.sha256 for o in artefact.manifest.outputs} | {artefact.manifest.content}
             for sha in contents:
-                self._holders.setdefault(sha, []).append(artefact.id)
+                found.setdefault(sha, []).append(artefact.id)
+        return found
 
     def parents(self, artefact: Artefact) -> dict[str, list[Artefact]]:
         """For each input role of ``artefact``, the artefacts with that content."""

@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import Busy, IntegrityError, IrlError, NewerFormat, NotFound
-from irlcli.store.artefact import entries, output_problem, read_artefact, recorded_command
+from irlcli.store.artefact import (
+    Artefact,
+    entries,
+    output_problem,
+    read_artefact,
+    recorded_command,
+)
+from irlcli.store.index import Index
 from irlcli.store.layout import Layout, claims
 from irlcli.store.lock import exclusive
 from irlcli.store.manifest import MANIFEST, PROVENANCE, read_provenance
@@ -33,46 +40,60 @@ def problems(layout: Layout, id16: str, quick: bool = False) -> list[str]:
     Raises:
         NewerFormat: the artefact has a newer schema and cannot be checked.
     """
+    return _examine(layout, id16, quick)[1]
+
+
+def _examine(layout: Layout, id16: str, quick: bool) -> tuple[Artefact | None, list[str]]:
+    """The artefact, if its manifest is sound, and its :func:`problems`."""
     try:
-        directory, manifest = read_artefact(layout.root / id16)
-        found = [
-            problem
-            for output in manifest.outputs
-            if (problem := output_problem(directory, output, quick))
-        ]
-        try:
-            read_provenance(directory, manifest.id)
-        except IntegrityError as error:
-            found.append(error.message)
-        known = {o.path for o in manifest.outputs} | {MANIFEST, PROVENANCE}
-        found += [
-            f"{path} is not in the manifest"
-            for path in entries(directory)
-            if path.relative_to(directory).as_posix() not in known
-        ]
-        return found
+        artefact = read_artefact(layout.root / id16)
     except NewerFormat:
         raise
     except IntegrityError as error:
-        return [error.message]
+        return None, [error.message]
+    try:
+        return artefact, _file_problems(artefact, quick)
     except OSError as error:
         # For example a file that another process removes at this moment.
-        return [f"{error.filename} cannot be read ({error.strerror})"]
+        return artefact, [f"{error.filename} cannot be read ({error.strerror})"]
 
 
-def verify(layout: Layout, ids: Iterable[str], quick: bool = False) -> dict[str, Damage]:
-    """Check artefacts and move the damaged ones to quarantine; returns those, by id.
+def _file_problems(artefact: Artefact, quick: bool) -> list[str]:
+    directory, manifest = artefact
+    found = [
+        problem
+        for output in manifest.outputs
+        if (problem := output_problem(directory, output, quick))
+    ]
+    try:
+        read_provenance(directory, manifest.id)
+    except IntegrityError as error:
+        found.append(error.message)
+    listed = (MANIFEST, PROVENANCE, *(output.path for output in manifest.outputs))
+    known = {f"{directory}/{path}" for path in listed}
+    found += [f"{path} is not in the manifest" for path in entries(directory) if path not in known]
+    return found
 
-    Artefacts of a newer schema are returned too (``newer``), but not moved.
+
+def verify(
+    layout: Layout, ids: Iterable[str], quick: bool = False
+) -> tuple[dict[str, Damage], Index]:
+    """Check artefacts and move the damaged ones to quarantine.
+
+    Returns the damaged ones, and what the sound ones were made from. Artefacts of a newer schema
+    are in both (``newer``); they are not moved.
     """
     found: dict[str, Damage] = {}
+    sound, unknown = {}, {}
     for id16 in ids:
         try:
-            failed = problems(layout, id16, quick)
+            artefact, failed = _examine(layout, id16, quick)
         except NewerFormat as error:
             found[id16] = Damage([f"{error.message}: {error.hint}"], "", newer=True)
+            unknown[id16] = (layout.root / id16 / MANIFEST).read_bytes()
             continue
-        if not failed:
+        if artefact is not None and not failed:
+            sound[id16] = artefact
             continue
         command, place = recorded_command(layout.root / id16), None
         if not layout.read_only:
@@ -87,7 +108,7 @@ def verify(layout: Layout, ids: Iterable[str], quick: bool = False) -> dict[str,
                 if place is None:
                     continue
         found[id16] = Damage(failed, command, place)
-    return found
+    return found, Index(sound, unknown)
 
 
 def damaged(layout: Layout, directory: Path, problem: str) -> IrlError:

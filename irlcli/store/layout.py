@@ -18,15 +18,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import IntegrityError, UsageError
+from irlcli.store.digest import is_hexadecimal
 from irlcli.store.durable import write_durably
 from irlcli.store.manifest import read_json
 
 FORMAT = 1
 DEFAULT_ROOT = "runs"
 ID_DIGITS = 16
-_ID = rf"[0-9a-f]{{{ID_DIGITS}}}"
-_KEY = r"[0-9a-f]{64}"
-_PREFIX = r"[0-9a-f]{3,64}"
+_KEY_DIGITS = 64
+_LEAST_DIGITS = 3
 _NAME = r"[A-Za-z][A-Za-z0-9._-]{0,99}"
 _OWN = (".keys", ".names", ".work", ".locks", ".quarantine")
 # Made by those who submit to a cluster.
@@ -142,17 +142,17 @@ def make_directories(layout: Layout) -> None:
 
 def is_id(text: str) -> bool:
     """Whether ``text`` is the name of an artefact's directory."""
-    return re.fullmatch(_ID, text) is not None
+    return len(text) == ID_DIGITS and is_hexadecimal(text)
 
 
 def is_prefix(text: str) -> bool:
     """Whether ``text`` can be the beginning of an id: 3 to 64 hexadecimal digits."""
-    return re.fullmatch(_PREFIX, text) is not None
+    return _LEAST_DIGITS <= len(text) <= _KEY_DIGITS and is_hexadecimal(text)
 
 
 def is_key(text: str) -> bool:
     """Whether ``text`` is a key: 64 hexadecimal digits."""
-    return re.fullmatch(_KEY, text) is not None
+    return len(text) == _KEY_DIGITS and is_hexadecimal(text)
 
 
 def is_name(text: str) -> bool:

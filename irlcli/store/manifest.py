@@ -5,24 +5,26 @@
 it carries its own checksum and the artefact's id.
 """
 
+import errno
 import json
-import re
+import os
 import stat
 from collections.abc import Iterable
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError, NewerFormat
-from irlcli.store.digest import canonical_json, digest, file_digest
+from irlcli.store.digest import digest, file_digest, is_hexadecimal
 
 SCHEMA = 1
 MANIFEST = "manifest.json"
 PROVENANCE = "provenance.json"
-_SHA = r"[0-9a-f]{64}"
 # Far larger than real files; anything larger is an accident or an attack.
 MAX_JSON_BYTES = 16 << 20
 # Every file system allows this, so checking a path never fails because of its length.
 _MAX_PATH_BYTES = 200
+# Of opening a path that is absent, below a file, a link, or a socket.
+_NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENXIO)
 
 
 class KeyRecord(NamedTuple):
@@ -114,16 +116,36 @@ def read_json(path: Path) -> Any:
     Raises:
         IntegrityError: missing, not a regular file, too large, not JSON, or nested too deeply.
     """
+    return _parse_json(path, _read(path))
+
+
+def _read(path: Path) -> bytes:
+    """The bytes of a regular file of at most 16 MiB.
+
+    Raises:
+        IntegrityError: missing, not a regular file, too large, or unreadable.
+    """
     try:
-        if path.is_symlink() or not path.is_file():
-            raise IntegrityError(f"{path} is missing or not a regular file")
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise IntegrityError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB")
-        return json.loads(path.read_bytes())
+        # Opened once, without following a link or waiting for a pipe's other end.
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with open(descriptor, "rb", buffering=0) as file:
+            information = os.fstat(descriptor)
+            if not stat.S_ISREG(information.st_mode):
+                raise IntegrityError(f"{path} is missing or not a regular file")
+            if information.st_size > MAX_JSON_BYTES:
+                raise IntegrityError(f"{path} is larger than {MAX_JSON_BYTES >> 20} MiB")
+            return file.read()
+    except OSError as error:
+        if error.errno in _NO_FILE:
+            raise IntegrityError(f"{path} is missing or not a regular file") from None
+        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
+
+
+def _parse_json(path: Path, data: bytes) -> Any:
+    try:
+        return json.loads(data)
     except (ValueError, RecursionError) as error:
         raise IntegrityError(f"{path} is not valid JSON ({error})") from None
-    except OSError as error:
-        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
 
 
 def read_manifest(directory: Path) -> Manifest:
@@ -134,17 +156,17 @@ def read_manifest(directory: Path) -> Manifest:
         NewerFormat: the schema is newer than this version supports.
     """
     path = directory / MANIFEST
-    value = read_json(path)
+    data = _read(path)
+    value = _parse_json(path, data)
     schema = value.get("schema") if isinstance(value, dict) else None
     if type(schema) is int and schema > SCHEMA:
         raise NewerFormat(str(path), schema, SCHEMA)
     try:
         manifest = _parse_manifest(value)
-        canonical = manifest.encode() == path.read_bytes()
+        # Encoding refuses NaN, which JSON's parser takes.
+        canonical = manifest.encode() == data
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise IntegrityError(f"{path} is malformed ({error})") from None
-    except OSError as error:
-        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
     if not canonical:
         raise IntegrityError(f"{path} was altered: it is not in canonical form")
     return manifest
@@ -163,7 +185,7 @@ def _parse_manifest(value: Any) -> Manifest:
     if not isinstance(value["parameters"], dict) or not isinstance(value["inputs"], dict):
         raise ValueError("parameters or inputs is not an object")
     for role, sha in value["inputs"].items():
-        if not isinstance(sha, str) or not re.fullmatch(_SHA, sha):
+        if not _is_sha256(sha):
             raise ValueError(f"input {role!r} is not a sha256")
     outputs = []
     if not isinstance(value["outputs"], list):
@@ -173,14 +195,17 @@ def _parse_manifest(value: Any) -> Manifest:
             raise ValueError("the keys of an output are not path, size, sha256")
         if type(item["size"]) is not int or item["size"] < 0:
             raise ValueError(f"output {item['path']!r} has no size")
-        if not isinstance(item["sha256"], str) or not re.fullmatch(_SHA, item["sha256"]):
+        if not _is_sha256(item["sha256"]):
             raise ValueError(f"output {item['path']!r} has no sha256")
         outputs.append(Output(check_output_path(item["path"]), item["size"], item["sha256"]))
     if len({o.path for o in outputs}) != len(outputs):
         raise ValueError("an output path appears twice")
     record = KeyRecord(value["stage"], value["stage_version"], value["parameters"], value["inputs"])
-    canonical_json(record.as_json())
     return Manifest(record, tuple(outputs))
+
+
+def _is_sha256(value: Any) -> bool:
+    return isinstance(value, str) and len(value) == 64 and is_hexadecimal(value)
 
 
 def check_output_path(path: Any) -> str:
@@ -196,8 +221,7 @@ def check_output_path(path: Any) -> str:
         raise ValueError(
             f"output path {path[:40]!r} is too long or contains unprintable characters"
         )
-    parts = PurePosixPath(path).parts
-    if path.startswith("/") or ".." in parts or "/".join(parts) != path:
+    if not {"", ".", ".."}.isdisjoint(path.split("/")):
         raise ValueError(f"output path {path!r} is not allowed")
     if path in (MANIFEST, PROVENANCE):
         raise ValueError(f"output path {path!r} is reserved")
@@ -218,15 +242,14 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
         IntegrityError: unreadable, altered, or written for another artefact.
     """
     path = directory / PROVENANCE
-    value = read_json(path)
+    data = _read(path)
+    value = _parse_json(path, data)
     if not isinstance(value, dict) or not isinstance(value.get("record"), dict):
         raise IntegrityError(f"{path} is malformed")
     try:
-        sound = path.read_bytes() == encode_provenance(value["artefact"], value["record"])
+        sound = data == encode_provenance(value["artefact"], value["record"])
     except (KeyError, TypeError, ValueError, RecursionError):
         sound = False
-    except OSError as error:
-        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
     if not sound:
         raise IntegrityError(f"{path} was altered: its checksum does not match")
     if value["artefact"] != artefact_id:

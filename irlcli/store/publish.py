@@ -61,7 +61,7 @@ def place_and_claim(
     for name, data in ((PROVENANCE, provenance), (MANIFEST, manifest.encode())):
         write_durably(output / name, data)
         (output / name).chmod(0o444)
-    for directory in {path.parent for path in entries(output)}:
+    for directory in {os.path.dirname(path) for path in entries(output)}:
         fsync_directory(directory)
     artefact = _place(layout, output, manifest)
     holder = claim(layout, artefact)

@@ -120,10 +120,10 @@ def ids(layout: Layout) -> list[str]:
         return []
 
 
-def index(layout: Layout, warn: Callable[[str], None] | None) -> Index:
+def index(layout: Layout, warn: Callable[[str], None]) -> Index:
     """All artefacts, each manifest read once.
 
-    Artefacts of a newer schema are left out, each with a warning if ``warn`` is given.
+    Artefacts of a newer schema are left out, each with a warning.
 
     Raises:
         IntegrityError: as :func:`get`.
@@ -137,8 +137,7 @@ def index(layout: Layout, warn: Callable[[str], None] | None) -> Index:
             continue
         except NewerFormat as error:
             newer[id16] = (layout.root / id16 / MANIFEST).read_bytes()
-            if warn is not None:
-                warn(f"skipping artefact {id16}: {error.message}; {error.hint}")
+            warn(f"skipping artefact {id16}: {error.message}; {error.hint}")
     return Index(artefacts, newer)
 
 

@@ -83,7 +83,7 @@ class Remote:
         """The ids of all artefacts, sorted, with those that are not whole yet."""
         return [name for name in self._list("") if is_id(name)]
 
-    def index(self, name_newer: bool = True) -> Index:
+    def index(self) -> Index:
         """All whole artefacts; those with unreadable manifests are skipped with a warning."""
         self._fetch(f"{id16}/{MANIFEST}" for id16 in self.ids())
         self._index = sound_manifests(self._layout, lambda text: self.warn(self._shown(text)))

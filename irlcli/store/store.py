@@ -114,12 +114,9 @@ class Store:
         """The ids of all artefacts, sorted."""
         return read.ids(self._layout)
 
-    def index(self, name_newer: bool = True) -> Index:
-        """All artefacts: see :func:`irlcli.store.read.index`.
-
-        ``name_newer`` warns about each artefact of a newer schema.
-        """
-        return read.index(self._layout, self.warn if name_newer else None)
+    def index(self) -> Index:
+        """All artefacts: see :func:`irlcli.store.read.index`."""
+        return read.index(self._layout, self.warn)
 
     def artefacts(self) -> Iterator[Artefact]:
         """The artefacts of :meth:`index`."""
@@ -275,7 +272,13 @@ class Store:
         return problems(self._layout, id16, quick)
 
     def verify(self, ids: Iterable[str], quick: bool = False) -> dict[str, Damage]:
-        """Check artefacts: see :func:`irlcli.store.integrity.verify`."""
+        """The damaged of the artefacts ``ids``: see :func:`irlcli.store.integrity.verify`."""
+        return self.verify_all(ids, quick)[0]
+
+    def verify_all(
+        self, ids: Iterable[str], quick: bool = False
+    ) -> tuple[dict[str, Damage], Index]:
+        """As :meth:`verify`, and the index of the sound ones, whose manifests it has read."""
         from irlcli.store.integrity import verify
 
         return verify(self._layout, ids, quick)
