@@ -7,6 +7,7 @@
 #                 `make table1.rewards` stops after a phase: experts, rewards, transfers or returns.
 # make report-table1      a report on what exists; runs nothing
 # make bench torture clean help
+# make bench-peers        training cost beside imitation and stable-baselines3 (docs/cost.md); takes hours
 # make test-cluster   the tests that need Slurm: installs it from Debian's packages, as root
 #
 #   PROFILE=smoke|standard|paper     budgets (settings/)
@@ -38,7 +39,7 @@ CHOSEN   = --store $(STORE) --profile $(PROFILE) $(foreach place,$(FROM),$(addpr
 OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
 
-.PHONY: help demo test test-cluster lint bench torture all-results experts table1 table2 figure2 figure3 figure4
+.PHONY: help demo test test-cluster lint bench bench-peers torture all-results experts table1 table2 figure2 figure3 figure4
 .PHONY: control control-airl control-airl-5 table1-5 gates retraining mujoco mujoco-gates clean
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -115,10 +116,20 @@ bench: $(READY)
 	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.robot_step; \
 	else echo "skipped benchmarks.robot_step: it counts instructions with valgrind"; fi
 
+# An environment of its own for imitation, whose dependencies are older than ours. Finished runs are kept.
+PEERS       ?= .venv-peers
+PEERS_OUT   ?= docs/results/peers
+$(PEERS)/.installed: benchmarks/peers/requirements.txt
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/pip install --quiet --requirement benchmarks/peers/requirements.txt
+	touch $@
+bench-peers: $(READY) $(PEERS)/.installed
+	$(VENV)/bin/python -m benchmarks.peers --jobs $(JOBS) --out $(PEERS_OUT) --peers-python $(PEERS)/bin/python $(ARGS)
+
 # The long form of tests/torture: each theme is a script that prints its figures. Takes over an hour.
 TORTURE ?= crash concurrency growth determinism fuzz
 torture: $(READY)
 	@set -e; for theme in $(TORTURE); do $(VENV)/bin/python tests/torture/$$theme.py; done
 
 clean:
-	rm -rf $(VENV) build
+	rm -rf $(VENV) $(PEERS) build

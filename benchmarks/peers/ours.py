@@ -1,0 +1,68 @@
+"""The stages ``train-airl`` and ``train-expert`` with the ``standard`` profile, one run a process.
+
+The stages run as they are. Only what follows a round is replaced: a check instead of a checkpoint.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.peers.checks import Checks, Ended
+from irlcli.configs import load_config
+from irlcli.interventions import parse_setting
+from irlcli.rl.loop import Training
+from irlcli.stages import train_airl, train_expert
+from irlcli.stages.base import Job, Source
+
+_OVERRIDES = {"airl-plain": ["airl.challenger.life=0"]}
+
+
+class _Quiet:
+    def progress(self, done: int, total: int, unit: str, facts: Any) -> None:
+        pass
+
+    def warn(self, message: str) -> None:
+        print(message, file=sys.stderr)
+
+
+def main() -> None:
+    """Run the task that the first argument describes, as JSON."""
+    run = json.loads(sys.argv[1])
+    env = run["row"].split(".")[0]
+    config = load_config(env, "standard", overrides=_OVERRIDES.get(run["method"], []))
+    settings = [parse_setting(env, text) for text in run["settings"]]
+    checks = Checks(run)
+    demos = Path(run["dataset"])
+    challenger_steps = 0
+    if run["method"] == "expert":
+        request = train_expert.request(env, settings[0], run["seed"], config.expert_of(settings[0]))
+    else:
+        # The defaults of grouping and penalty are ERM's.
+        airl = config.airl_of(settings[0])
+        request = train_airl.request(Source(demos, ""), env, settings, airl, run["seed"])
+        if airl.challenger.life > 0:
+            challenger_steps = airl.challenger.ppo.steps_per_round
+
+    def run_training(job: Job, training: Training) -> None:
+        def after_round(training: Training, rows: Any) -> None:
+            steps = training.trainer.steps + training.rounds_done * challenger_steps
+            policy = training.trainer.policy
+            checks.after(steps, lambda seen: policy.act(seen, deterministic=True))
+
+        checks.begin()
+        training.run(after_round, job.console.warn)
+        checks.end("budget")
+
+    train_airl.run_training = train_expert.run_training = run_training
+    inputs = {"demonstrations": demos}
+    with tempfile.TemporaryDirectory() as output, contextlib.suppress(Ended):
+        request.stage.run(Job(request.parameters, inputs, Path(output), None, _Quiet()))
+
+
+if __name__ == "__main__":
+    main()
