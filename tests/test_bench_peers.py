@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from benchmarks.peers.__main__ import main
+from benchmarks.peers.__main__ import enough, main
 from benchmarks.peers.checks import first_kept, share
 from benchmarks.peers.results import read_run, tables, until_text, write
 from benchmarks.peers.tasks import METHODS, ROWS, chosen, tasks
@@ -89,6 +89,15 @@ def test_a_partial_benchmark_says_what_is_missing(record, tmp_path):
     assert "experts of engine-power=1x" in page
     assert (tmp_path / "peers.png").stat().st_size > 1000
     assert len((tmp_path / "checks.csv").read_text().splitlines()) == 3
+
+
+def test_only_a_run_stopped_by_a_lower_limit_is_repeated(record, tmp_path):
+    record("airl", 1, [0.5], "limit")
+    record("airl", 2, [0.95, 0.95], "goal")
+    assert enough(tmp_path / "airl.1.jsonl", 60)
+    assert not enough(tmp_path / "airl.1.jsonl", 1800)
+    assert enough(tmp_path / "airl.2.jsonl", 1800)
+    assert not enough(tmp_path / "airl.3.jsonl", 60)
 
 
 def test_experts_have_one_setting_and_students_all():

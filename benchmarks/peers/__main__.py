@@ -85,7 +85,8 @@ def _run(options: argparse.Namespace) -> None:
     wanted = tasks(settings, options.methods, options.seeds)
     runs = options.out / "runs"
     runs.mkdir(parents=True, exist_ok=True)
-    missing = [task for task in wanted if not (runs / f"{task.name}.jsonl").exists()]
+    files = {task: runs / f"{task.name}.jsonl" for task in wanted}
+    missing = [task for task in wanted if not enough(files[task], options.limit)]
     failed: list[str] = []
     if not options.report:
         theirs = any(METHODS[task.method].module == "theirs" for task in missing)
@@ -107,8 +108,7 @@ def _run(options: argparse.Namespace) -> None:
 
         pool = ThreadPoolExecutor(options.jobs)
         failed = [name for name in pool.map(execute, missing) if name]
-    finished = [runs / f"{task.name}.jsonl" for task in wanted]
-    found = [read_run(path) for path in finished if path.exists()]
+    found = [read_run(path) for path in files.values() if path.exists()]
     if found:
         command = shlex.join(["python", "-m", "benchmarks.peers", *sys.argv[1:]])
         write(options.out, found, len(wanted), command)
@@ -119,6 +119,14 @@ def _run(options: argparse.Namespace) -> None:
         )
     if not found:
         raise StageFailed("no run has finished", "omit --report to run what is missing")
+
+
+def enough(path: Path, limit: float) -> bool:
+    """Whether a run is finished, and not by a lower limit than ``limit``."""
+    if not path.exists():
+        return False
+    run = read_run(path)
+    return run.end != "limit" or run.about["limit"] >= limit
 
 
 def _execute(task: Task, run: dict[str, Any], runs: Path, peers: Path) -> str | None:

@@ -96,13 +96,13 @@ def tables(runs: Sequence[Run]) -> dict[str, str]:
                 )
                 for unit in ("cpu_seconds", "steps")
             ]
-            kept = statistics.median(run.kept for run in own)
+            kept = [run.kept for run in own if not math.isnan(run.kept)]
             rows.append(
                 [
                     method.title,
                     str(len(own)),
                     *costs,
-                    "-" if math.isnan(kept) else f"{kept:.0%}",
+                    f"{statistics.median(kept):.0%}" if kept else "-",
                     f"{ends[0]} s, {ends[1]} steps",
                 ]
             )
@@ -140,7 +140,8 @@ def write(directory: Path, runs: Sequence[Run], wanted: int, command: str) -> No
     (directory / "README.md").write_text(
         f"# CPU seconds to a result, beside other libraries\n\n`{command}`\n\n{missing}"
         f"{''.join(sections)}{_NOTE}\n![share of the experts' return](peers.png)\n\n"
-        "Share of the experts' true return at every check, a line per seed.\n\n"
+        "Share of the experts' true return at every check, a line per seed. Shares below -1 are drawn at "
+        "-1.\n\n"
         "`peers.csv` has a row per run, `checks.csv` a row per check.\n\n" + _provenance(runs)
     )
     _draw(directory / "peers.png", runs)
@@ -177,6 +178,11 @@ def _provenance(runs: Sequence[Run]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _colour(method: str) -> str:
+    alike = [name for name, other in METHODS.items() if other.expert == METHODS[method].expert]
+    return _COLOURS[alike.index(method)]
+
+
 def _draw(path: Path, runs: Sequence[Run]) -> None:
     groups = list(dict.fromkeys(run.task.group for run in runs))
     with plt.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
@@ -186,14 +192,15 @@ def _draw(path: Path, runs: Sequence[Run]) -> None:
         )
         for axis, group in zip(axes[:, 0], groups, strict=True):
             members = [run for run in runs if run.task.group == group]
-            methods = [name for name in METHODS if name in {run.task.method for run in members}]
             for run in members:
                 first = run is next(r for r in members if r.task.method == run.task.method)
                 axis.plot(
                     [check["cpu_seconds"] for check in run.checks],
                     [max(part, -1.0) for part in run.shares],
-                    color=_COLOURS[methods.index(run.task.method)],
-                    lw=1.2,
+                    color=_colour(run.task.method),
+                    marker=".",
+                    ms=3,
+                    lw=1.0,
                     label=METHODS[run.task.method].title if first else None,
                 )
             for goal in GOALS:
