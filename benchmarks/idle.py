@@ -19,7 +19,6 @@ from benchmarks.sharing import IRL
 from irlcli.configs import load_config
 from irlcli.experiments import report
 from irlcli.experiments.plan import Plan, Selection
-from irlcli.experiments.rows import PHASES
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import load_table
 from irlcli.store import Store
@@ -36,13 +35,12 @@ def main() -> None:
         plan = Plan(load_table(TABLE), Selection(PROFILE), load, Lookup(store))
         fill(plan, store)
         add_report(plan, store)
+        print(f"{len(plan.tasks)} steps, all there{'':21}{'CPU s':>8}")
         words = [TABLE, "--store", str(store.root)]
-        print(f"{TABLE}, {len(plan.tasks)} steps{'':28}{'CPU s':>8}")
         measure(f"irl plan {TABLE}", [*IRL, "plan", *words])
-        run = [*IRL, "run", *words, "--out", f"{directory}/results"]
-        measure(f"irl run {TABLE}", run)
-        for phase in PHASES:
-            measure(f"irl run {TABLE} --until {phase}", [*IRL, "run", *words, "--until", phase])
+        measure(f"irl run {TABLE}", [*IRL, "run", *words, "--out", f"{directory}/results"])
+        places = [f"STORE={store.root}", "FROM=", f"RESULTS={directory}/results"]
+        measure(f"make {TABLE}", ["make", f"IRL={' '.join(IRL)}", "READY=", *places, TABLE])
 
 
 def load(env, flags, overrides):
