@@ -108,6 +108,7 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.growth
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
 	$(VENV)/bin/python -m benchmarks.startup
+	$(VENV)/bin/python -m benchmarks.idle
 	$(VENV)/bin/python -m benchmarks.workers
 	$(VENV)/bin/python -m benchmarks.mujoco_threads
 	$(VENV)/bin/python -m benchmarks.data

@@ -5,7 +5,8 @@
 Counts are the difference of two run lengths, so start-up, reset and imports cancel, and they
 do not depend on what else the machine is doing. Needs ``valgrind`` on the path. Actions are
 uniform in the whole range, the same for every run. A name that ends in ``-original`` is PyBullet's
-original model, one that ends in ``-gymnasium`` Gymnasium's own MuJoCo environment.
+original model, one that ends in ``-bullet`` Bullet's step under the same torques alone, one that
+ends in ``-gymnasium`` Gymnasium's own MuJoCo environment.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ NO_REP = "glibc.cpu.x86_rep_movsb_threshold=1000000000:glibc.cpu.x86_rep_stosb_t
 MUJOCO = ("Ant", "HalfCheetah", "Hopper", "Walker2d", "Humanoid")
 WORLDS = (
     "ant",
+    "ant-bullet",
     "half-cheetah",
+    "half-cheetah-bullet",
     "reacher",
     *(f"mujoco-{name}{of}" for name in MUJOCO for of in ("", "-gymnasium")),
 )
@@ -47,7 +50,7 @@ def make(name: str):
     from irlcli.envs.reacher.env import Reacher
 
     robots = {"ant": Ant, "half-cheetah": HalfCheetah, "reacher": Reacher}
-    robot = robots[name.removesuffix("-original")]
+    robot = robots[name.removesuffix("-bullet").removesuffix("-original")]
     return robot(model="original" if name.endswith("-original") else "merged")
 
 
@@ -58,7 +61,11 @@ def roll_out(name: str, steps: int) -> None:
     random = np.random.default_rng(0)
     bound = env.action_space.high[0]
     for action in random.uniform(-bound, bound, (LONG, *env.action_space.shape))[:steps]:
-        env.step(action)
+        if name.endswith("-bullet"):
+            env._robot.drive(env.torques * action)
+            env._world.step()
+        else:
+            env.step(action)
     env.close()
 
 
