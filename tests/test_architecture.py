@@ -47,7 +47,7 @@ NEVER = {
     "interventions": HEAVY | {"numpy", "msgspec", "pathlib"},
     "trajectories": (HEAVY | {"msgspec", "pathlib", "irlcli"}),
     "tabular": (HEAVY - {"scipy"}) | {"pathlib", "irlcli"},
-    "store": HEAVY | {"numpy"},
+    "store": HEAVY | {"numpy", "msgspec"},
     "envs": {"torch", "stable_baselines3", "pandas", "pyarrow", "irlcli.store", "irlcli.learners"},
     "learners": FILES
     | {"stable_baselines3", "gymnasium", "pandas", "pyarrow", "logging"}

@@ -200,6 +200,7 @@ class LongTraining:
 
     def __init__(self, rows: int):
         self.rows = [self.ROW] * rows
+        self.rounds_done = 1
         self.trainer = SimpleNamespace(steps=1, rounds=1, steps_per_round=1)
 
     def state_dict(self) -> dict[str, Any]:

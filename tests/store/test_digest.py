@@ -7,11 +7,11 @@ from collections import OrderedDict
 from enum import IntEnum
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from irlcli.store import KeyRecord, canonical_json, content_digest, digest, file_digest
-from irlcli.store.manifest import Manifest, Output
+from irlcli.store.manifest import Output
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.text()
 SCALARS |= st.floats(allow_nan=False, allow_infinity=False)
@@ -88,15 +88,6 @@ def test_key_order_never_matters(value, random):
 @given(VALUES, VALUES)
 def test_equal_bytes_mean_equal_values(one, other):
     assert (canonical_json(one) == canonical_json(other)) == (typed(one) == typed(other))
-
-
-@given(st.dictionaries(st.text(st.characters(exclude_categories=())), VALUES))
-@example({"undecodable": "\udcff"})
-def test_a_manifest_is_indented_as_the_standard_library_indents(parameters):
-    """Existing manifests are compared with these bytes, so they must never change."""
-    manifest = Manifest(KeyRecord("s", 1, parameters, {}), (Output("f", 1, "0" * 64),))
-    data = manifest.encode()
-    assert data == json.dumps(json.loads(data), indent=1, sort_keys=True).encode() + b"\n"
 
 
 def test_bool_int_float_and_text_are_distinct():
