@@ -7,6 +7,7 @@ Run with ``python -m benchmarks.idle``; by ``make bench``.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import statistics
@@ -29,6 +30,7 @@ REPEATS = 3
 
 def main() -> None:
     """Print a line for each command."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     with tempfile.TemporaryDirectory() as directory:
         store = Store(Path(directory) / "runs")
         store.create()

@@ -23,6 +23,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=10, help="airl.plateau_rounds")
     parser.add_argument("--only", default="", help="part of the description, e.g. lunar-lander")
     arguments = parser.parse_args()
+    if not arguments.store.is_dir():
+        parser.error(f"there is no store at {arguments.store}")
+    if arguments.rounds < 1:
+        parser.error("--rounds must be at least 1")
     store = Store(arguments.store)
     print(f"{'ends at':>8}{'return there':>14}{'at the end':>12}  training")
     records = [(describe(a.manifest.record), a) for a in store.artefacts()]

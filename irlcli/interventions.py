@@ -220,6 +220,11 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
         if "=" in part:
             other = part.partition("=")[0].strip()
             knob_of(env, other)
+            if other == knob:
+                raise UsageError(
+                    f"{text!r} names {knob} twice",
+                    f"write the knob once, then its values: {knob}=VALUE,VALUE",
+                )
             raise UsageError(
                 f"{text!r} gives values of two knobs, {knob} and {other}",
                 "to change both in one setting, write --setting "

@@ -217,6 +217,12 @@ def test_values_of_two_knobs_are_refused_and_the_hint_shows_the_setting_of_both(
     assert "--setting plain=1,double=2x" in caught.value.hint
 
 
+def test_a_knob_that_is_named_twice_is_refused_and_the_hint_writes_it_once():
+    with pytest.raises(UsageError, match="names plain twice") as caught:
+        parse_settings(WORLD, "plain=1,plain=2")
+    assert caught.value.hint.endswith("plain=VALUE,VALUE")
+
+
 @pytest.mark.parametrize("value", ["0.5", "2", "yes"])
 def test_a_switch_that_is_not_0_or_1_is_refused_with_a_value_that_works(value):
     with pytest.raises(UsageError, match=f"terminate-when-unhealthy='{value}'") as caught:

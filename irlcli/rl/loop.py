@@ -172,7 +172,10 @@ class Training:
         after_round: Callable[[Training, list[Row]], None],
         warn: Callable[[str], None],
     ) -> list[Row]:
-        """Train to the last round, or to where ``ends`` says so, and return all rows; ``after_round`` gets each round's rows."""
+        """Train to the last round, or to where ``ends`` says so, and return all rows.
+
+        ``after_round`` gets each round's rows.
+        """
         if self.rounds_done == 0:
             self.learner.begin(self.trainer)
         for index in range(self.rounds_done, self.trainer.rounds):

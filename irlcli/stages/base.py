@@ -201,11 +201,9 @@ def run_training(job: Job, training: Training) -> list[Row]:
 
     rows = training.run(after_round, job.console.warn)
     if training.rounds_done < training.trainer.rounds:
-        steps, early = (
-            training.trainer.steps,
-            f"{training.rounds_done} of {training.trainer.rounds}",
-        )
-        job.console.progress(steps, steps, "steps", {"ended after": f"{early} rounds"})
+        steps = training.trainer.steps
+        done = f"{training.rounds_done} of {training.trainer.rounds} rounds"
+        job.console.progress(steps, steps, "steps", {"ended after": done})
     return rows
 
 

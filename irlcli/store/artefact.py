@@ -99,12 +99,15 @@ def entries(directory: Path | str) -> Iterator[str]:
     Raises:
         OSError: a directory cannot be listed.
     """
-    with os.scandir(directory) as listed:
-        for entry in listed:
-            if entry.is_dir(follow_symlinks=False):
-                yield from entries(entry.path)
-            else:
-                yield entry.path
+    # No recursion: a hostile artefact may nest deeper than Python's stack.
+    directories = [os.fspath(directory)]
+    while directories:
+        with os.scandir(directories.pop()) as listed:
+            for entry in listed:
+                if entry.is_dir(follow_symlinks=False):
+                    directories.append(entry.path)
+                else:
+                    yield entry.path
 
 
 def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[str]:

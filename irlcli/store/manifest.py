@@ -21,10 +21,13 @@ MANIFEST = "manifest.json"
 PROVENANCE = "provenance.json"
 # Far larger than real files; anything larger is an accident or an attack.
 MAX_JSON_BYTES = 16 << 20
+# A canonical manifest indents each level by a space. Real parameters have fewer than ten levels;
+# far more would exhaust the stack of whoever hashes them.
+_TOO_DEEP = b"\n" + b" " * 100
 # Every file system allows this, so checking a path never fails because of its length.
 _MAX_PATH_BYTES = 200
-# Of opening a path that is absent, below a file, a link, or a socket.
-_NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENXIO)
+# Of opening a path that is absent, below a file, a link, a socket, or a directory.
+_NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENXIO, errno.EISDIR)
 
 
 class KeyRecord(NamedTuple):
@@ -126,10 +129,8 @@ def _read(path: Path) -> bytes:
         IntegrityError: missing, not a regular file, too large, or unreadable.
     """
     try:
-        # Opened once, without following a link or waiting for a pipe's other end.
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with open(descriptor, "rb", buffering=0) as file:
-            information = os.fstat(descriptor)
+        with open(path, "rb", buffering=0, opener=_open_plainly) as file:
+            information = os.fstat(file.fileno())
             if not stat.S_ISREG(information.st_mode):
                 raise IntegrityError(f"{path} is missing or not a regular file")
             if information.st_size > MAX_JSON_BYTES:
@@ -139,6 +140,11 @@ def _read(path: Path) -> bytes:
         if error.errno in _NO_FILE:
             raise IntegrityError(f"{path} is missing or not a regular file") from None
         raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
+
+
+def _open_plainly(path: str, flags: int) -> int:
+    # Without following a link or waiting for a pipe's other end.
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def _parse_json(path: Path, data: bytes) -> Any:
@@ -157,6 +163,8 @@ def read_manifest(directory: Path) -> Manifest:
     """
     path = directory / MANIFEST
     data = _read(path)
+    if _TOO_DEEP in data:
+        raise IntegrityError(f"{path} is nested too deeply")
     value = _parse_json(path, data)
     schema = value.get("schema") if isinstance(value, dict) else None
     if type(schema) is int and schema > SCHEMA:

@@ -136,6 +136,39 @@ def test_verify_detects_added_files(empty_store, victim, name, kind):
     assert_set_aside(empty_store, victim)
 
 
+def test_verify_detects_a_file_below_more_directories_than_pythons_stack_has_frames(
+    empty_store, victim, monkeypatch
+):
+    monkeypatch.chdir(victim.directory)
+    for _ in range(1200):
+        os.mkdir("d")
+        os.chdir("d")
+    Path("extra").touch()
+    (problem,) = empty_store.verify([victim.id])[victim.id].problems
+    assert problem.endswith("/d/extra is not in the manifest")
+
+
+@pytest.mark.parametrize("depth", [100, 985, 990, 995])
+def test_a_manifest_that_is_nested_too_deeply_is_refused(tmp_path, depth):
+    """Also where it can just be parsed, and not be hashed."""
+    value = "1"
+    for level in reversed(range(depth)):
+        value = f"[\n{' ' * (level + 3)}{value}\n{' ' * (level + 2)}]"
+    form = Manifest(KeyRecord("s", 1, {"x": "HERE"}, {}), ()).encode()
+    (tmp_path / "manifest.json").write_bytes(form.replace(b'"HERE"', value.encode()))
+    with pytest.raises(IntegrityError, match="nested too deeply"):
+        read_manifest(tmp_path)
+
+
+def test_directories_in_place_of_manifests_leave_no_file_open(tmp_path):
+    (tmp_path / "manifest.json").mkdir()
+    before = os.listdir("/proc/self/fd")
+    for _ in range(3):
+        with pytest.raises(IntegrityError, match="missing or not a regular file"):
+            read_manifest(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == len(before)
+
+
 def test_verify_detects_an_artefact_that_is_a_link_out_of_the_store(empty_store, victim, tmp_path):
     victim.directory.chmod(0o755)
     shutil.move(victim.directory, tmp_path / "elsewhere")
