@@ -82,9 +82,10 @@ def test_training_ends_at_the_plateau_and_says_so(line, run_irl):
     assert "to a plateau" in describe(artefact.manifest.record)
 
 
-def test_a_training_that_never_gets_there_uses_its_budget(line, run_irl):
-    """And is another artefact than without the rule: its key cannot know."""
-    done = run_irl([*line, "--set", "airl.plateau_rounds=2"])
+def test_rounds_of_the_penaltys_ramp_do_not_count_and_the_budget_is_used(line, run_irl):
+    """The ramp is one round of three, and after the two others nothing is left to save."""
+    penalty = ["--method", "irm", "--penalty-weight", "0.01"]
+    done = run_irl([*line, *penalty, "--set", "airl.plateau_rounds=1"])
     assert done.code == 0, done.err
     assert "ended after" not in done.err
     store = Store(line[line.index("--store") + 1])
