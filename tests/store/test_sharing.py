@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from irlcli.errors import Busy, IntegrityError, NotFound
-from irlcli.store import KeyRecord, Store, collect, integrity
+from irlcli.store import Index, KeyRecord, Store, collect, integrity
 from irlcli.store import artefact as artefact_module
 from irlcli.store import publish as publishing
 
@@ -107,6 +107,8 @@ def test_verify_reports_missing_artefacts(irl, empty_store, publish):
         empty_store.set_name(name, artefact)
     sound = irl("verify", "--store", empty_store.root)
     assert (sound.code, sound.out, sound.err) == (0, "4 artefacts verified\n", "")
+    # What another process published while the artefacts were read is not missing.
+    assert empty_store.missing(Index({reward.id: reward}, {})) == {}
     shutil.rmtree(demos.directory)
     result = irl("verify", "--json", "--store", empty_store.root)
     said = json.loads(result.out)
