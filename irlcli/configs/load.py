@@ -365,8 +365,10 @@ def _field_hint(field: str) -> str:
                 known = value is not None and not unset
                 return f"{bounds}, for example {_shown(value)}" if known else bounds
     if unset:
-        whole = any(int in get_args(member) for member in get_args(kind))
-        return "write a whole number from 0, or omit it" if whole else "write a value, or omit it"
+        for member in get_args(kind):
+            if int in get_args(member):
+                return f"write a whole number from {member.__metadata__[0].ge}, or omit it"
+        return "write a value, or omit it"
     if value is None:
         return "write a value, or none"
     return f"for example {_shown(value)}"
