@@ -1,7 +1,7 @@
 """irlcli.Lab: the command line's artefacts from Python, its errors, and interruption."""
 
-import re
 import inspect
+import re
 import signal
 import subprocess
 import sys
