@@ -208,8 +208,7 @@ def run(
     options = ClusterOptions(
         cluster, partition, time, cpus, array_parallelism, sbatch, requeues, jobs
     )
-    if cluster is not None or not (status or cancel):
-        options.check_used(detach)
+    options.check_used(detach)
     if status + cancel + detach > 1:
         raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
     runner = session.runner()

@@ -158,6 +158,7 @@ def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):
         (["--sbatch", "account=mine"], "--cluster slurm"),
         (["--time", "4:00:00"], "--cluster slurm"),
         (["--cpus", "2"], "--cluster slurm"),
+        (["--status", "--time", "60"], "--cluster slurm"),
         (["--array-parallelism", "2"], "--cluster slurm"),
         (["--requeues", "0"], "--cluster slurm"),
         (["--cluster", "local", "--partition", "long"], "--partition is about Slurm"),

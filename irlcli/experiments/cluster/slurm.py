@@ -231,13 +231,17 @@ def _allocate(command: Sequence[str], explain: Callable[[str], None]) -> tuple[s
     ) as process:
         assert process.stdout is not None and process.stderr is not None
         errors: list[str] = []
-        for line in process.stderr:
-            if line.rstrip().endswith("queued and waiting for resources"):
-                if errors:
-                    explain(errors[-1].removeprefix("srun:").strip())
-            elif not line.rstrip().endswith("has been allocated resources"):
-                errors.append(line)
-        return process.stdout.read(), "".join(errors)
+        try:
+            for line in process.stderr:
+                if line.rstrip().endswith("queued and waiting for resources"):
+                    if errors:
+                        explain(errors[-1].removeprefix("srun:").strip())
+                elif not line.rstrip().endswith("has been allocated resources"):
+                    errors.append(line)
+            return process.stdout.read(), "".join(errors)
+        except BaseException:
+            process.kill()
+            raise
 
 
 def _say(*command: str) -> subprocess.CompletedProcess[str]:
