@@ -208,7 +208,8 @@ def run(job: Job) -> None:
                 return False
             # Until then the loss itself changes.
             first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
-            return plateaued(cross_entropies(rows, first), airl.plateau_rounds)
+            newest = rows[-2 * airl.plateau_rounds * len(settings) :]
+            return plateaued(cross_entropies(newest, first), airl.plateau_rounds)
 
         training = Training(
             trainer, learner, learner, selector, settings, challengers, at_a_plateau
