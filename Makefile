@@ -12,7 +12,7 @@
 #
 #   PROFILE=smoke|standard|paper     budgets (settings/)
 #   SEEDS="0 1 2"  METHODS="erm irm" instead of those in settings/experiments.toml
-#   ENVIRONMENT=lunar-lander         only the rows of one environment
+#   ROWS=lunar-lander,ant.friction   only these rows, or all rows of an environment
 #   SET="--set FIELD=VALUE"          other hyperparameters; needs a TAG
 #   CHOOSE="--choose-penalty 1,10"   lambda by leaving a setting out; needs a TAG
 #   TAG=NAME                         what the artefacts' names begin with; by default the profile
@@ -30,12 +30,12 @@ STORE   ?= $(or $(IRL_STORE),runs)
 PROFILE ?= standard
 JOBS    ?= 2
 FROM    ?= zoo
-RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(addprefix -,$(ENVIRONMENT))
+RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(addprefix -,$(ROWS))
 
 IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
 CHOSEN   = --store $(STORE) --profile $(PROFILE) $(foreach place,$(FROM),$(addprefix --from ,$(if $(findstring ://,$(place)),$(place),$(wildcard $(place))))) $(SET) $(CHOOSE) \
-    $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --env ,$(ENVIRONMENT))
+    $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --rows ,$(ROWS))
 OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
 
@@ -89,8 +89,8 @@ experts figure2 control: $(READY)
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 
 report-%: $(READY)
-	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(addprefix -,$(ENVIRONMENT)) \
-	    --out results/$(or $(TAG),$(PROFILE))/$*$(addprefix -,$(ENVIRONMENT))
+	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(addprefix -,$(ROWS)) \
+	    --out results/$(or $(TAG),$(PROFILE))/$*$(addprefix -,$(ROWS))
 
 # The values of settings/*.toml; needs no store.
 table2: $(READY)

@@ -56,7 +56,7 @@ def test_the_wheel_has_the_version_of_the_package(wheel: Path) -> None:
     [
         (["--version"], irlcli.__version__),
         (["report", "table2"], "engine-power"),
-        (["plan", "table1", "--env", "lunar-lander"], "lunar-lander.bounce.erm.0"),
+        (["plan", "table1", "--rows", "lunar-lander"], "lunar-lander.bounce.erm.0"),
     ],
 )
 def test_the_installed_command_runs_outside_the_checkout(

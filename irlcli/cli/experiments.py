@@ -28,7 +28,10 @@ _TableName = Annotated[
 ]
 Seeds = Annotated[str | None, typer.Option(help="Seeds of the reward learning, e.g. 0,1,2.")]
 Methods = Annotated[str | None, typer.Option(help="Methods to compare, e.g. erm,irm.")]
-RowsEnv = Annotated[str | None, typer.Option(help="Only the rows of this environment.")]
+Rows = Annotated[
+    str | None,
+    typer.Option(help="Only these rows, e.g. lunar-lander.bounce, or ant for all of Ant's."),
+]
 ChoosePenalty = Annotated[
     str | None,
     typer.Option(
@@ -59,7 +62,7 @@ def plan(
     table: _TableName,
     seeds: Seeds = None,
     methods: Methods = None,
-    env: RowsEnv = None,
+    rows: Rows = None,
     choose_penalty: ChoosePenalty = None,
     until: _Until = None,
     only: _Only = None,
@@ -79,7 +82,7 @@ def plan(
         raise UsageError(f"unknown --to {to!r}", "snakemake")
     if to is not None and session.as_json:
         raise UsageError("--to prints no JSON", "omit --json or --to")
-    choice = Choice(table, seeds, methods, env, choose_penalty, until, only, tag, experiments)
+    choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     found = open_plan(session, choice)
     if to is None:
         _print_plan(session, choice, found)
@@ -119,7 +122,7 @@ def run(
     jobs: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 1,
     seeds: Seeds = None,
     methods: Methods = None,
-    env: RowsEnv = None,
+    rows: Rows = None,
     choose_penalty: ChoosePenalty = None,
     until: _Until = None,
     only: _Only = None,
@@ -190,7 +193,7 @@ def run(
     after a failure or an interruption: finished steps are kept, interrupted ones resume. With
     --cluster the processes are jobs; --status and --cancel are about those of the same table.
     """
-    choice = Choice(table, seeds, methods, env, choose_penalty, until, only, tag, experiments)
+    choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     if session.dry_run:
         _print_plan(session, choice, open_plan(session, choice))
         return
@@ -307,8 +310,7 @@ def _report(
         artefact = runner.run(request)
     finally:
         session.console.close()
-    suffix = "" if choice.env is None else f"-{choice.env}"
-    name = f"{found.selection.tag}.{choice.table}{suffix}"
+    name = "-".join([f"{found.selection.tag}.{choice.table}", *(choice.row_names() or ())])
     runner.name(name, artefact)
     if directory is not None:
         copy_outputs(session, artefact, directory)

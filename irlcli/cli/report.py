@@ -11,7 +11,7 @@ from irlcli.cli import returns
 from irlcli.cli.experiments import (
     ChoosePenalty,
     Methods,
-    RowsEnv,
+    Rows,
     Seeds,
     TableFile,
 )
@@ -51,7 +51,7 @@ def report(
     refs: Annotated[list[str] | None, typer.Argument(help="Evaluations, for returns.")] = None,
     seeds: Seeds = None,
     methods: Methods = None,
-    env: RowsEnv = None,
+    rows: Rows = None,
     choose_penalty: ChoosePenalty = None,
     form: Annotated[
         str | None,
@@ -72,7 +72,7 @@ def report(
     options = {
         "--seeds": seeds,
         "--methods": methods,
-        "--env": env,
+        "--rows": rows,
         "--choose-penalty": choose_penalty,
         "--experiments": file,
         "--format": form,
@@ -95,7 +95,7 @@ def report(
             _refuse(kind, options, "--format")
             _table2(session, form)
         case _:
-            chosen = Choice(kind, seeds, methods, env, choose_penalty, file=file)
+            chosen = Choice(kind, seeds, methods, rows, choose_penalty, file=file)
             _check_kind(chosen)
             if form is not None:
                 raise UsageError(f"{kind} takes no --format", "omit --format")

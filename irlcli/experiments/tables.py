@@ -115,19 +115,24 @@ def narrowed(
     table: Table,
     methods: Sequence[str] | None = None,
     seeds: Sequence[int] | None = None,
-    env: str | None = None,
+    rows: Sequence[str] | None = None,
 ) -> Table:
-    """``table`` with other methods and seeds, and only the rows of one environment.
+    """``table`` with other methods and seeds, and only some of its rows.
 
-    The experts' table has rows of every environment that can be named, also of one's own.
+    Args:
+        table: as the file has it.
+        methods: instead of the table's.
+        seeds: instead of the table's.
+        rows: environments, for all their rows, and single rows such as ``ant.friction``. The
+            experts' table has rows of every environment that can be named, also of one's own.
 
     Raises:
-        UsageError: an unknown or repeated method or seed, an empty list, no row of ``env``, a
-            table of a kind without them, or measures that a method does not have.
+        UsageError: an unknown or repeated method, seed or row, an empty list, a table of a kind
+            without them, or measures that a method does not have.
     """
     given = {"--methods": methods, "--seeds": seeds}
     if table.kind != "comparison":
-        given |= {"--env": env} if table.kind in ("figure2", "control") else {}
+        given |= {"--rows": rows} if table.kind in ("figure2", "control") else {}
         for option, value in given.items():
             if value is not None:
                 raise UsageError(f"{table.name} takes no {option}", f"omit {option}")
@@ -141,14 +146,14 @@ def narrowed(
     if seeds is not None:
         _check_list("--seeds", seeds)
         changes["seeds"] = tuple(seeds)
-    if env is not None:
-        rows = table.rows
-        if table.kind == "experts" and env not in ENVIRONMENTS:
-            rows = _rows_of(environment(env))
-        changes["rows"] = tuple(row for row in rows if row.env == env)
-        if not changes["rows"]:
-            names = {row.env for row in rows}
-            raise UsageError(f"{table.name} has no row of {env!r}", suggest(env, names))
+    if rows is not None:
+        offered = table.rows
+        if table.kind == "experts":
+            own = {name.partition(".")[0] for name in rows} - {row.env for row in offered}
+            offered += _rows_of(*(environment(env) for env in sorted(own)))
+        names = {name: None for row in offered for name in (row.env, str(row))}
+        _check_list("--rows", rows, names)
+        changes["rows"] = tuple(row for row in offered if {row.env, str(row)} & set(rows))
     return msgspec.structs.replace(table, **changes)
 
 

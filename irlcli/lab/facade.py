@@ -349,7 +349,7 @@ class Lab:
         *,
         seeds: int | Sequence[int] | None = None,
         methods: str | Sequence[str] | None = None,
-        env: str | Path | None = None,
+        rows: str | Sequence[str] | None = None,
         choose_penalty: Sequence[float] | str | None = None,
         until: str | None = None,
         only: str | None = None,
@@ -361,7 +361,7 @@ class Lab:
 
         Args:
             table: ``table1``, ...
-            seeds, methods, env: only these, of the table's.
+            seeds, methods, rows: only these, of the table's.
             choose_penalty: candidates for lambda, or ``own``.
             until: last phase: ``experts``, ``demos``, ``rewards``, ``transfers`` or ``returns``.
             only: one step and what it needs.
@@ -373,7 +373,7 @@ class Lab:
             table,
             joined(seeds),
             joined(methods),
-            None if env is None else str(env),
+            joined(rows),
             joined(choose_penalty),
             until,
             only,

@@ -167,9 +167,16 @@ def env_name(ref: str | None) -> str | None:
     return None if ref is None else resolve(ref).name
 
 
-def row_env(ref: str | None) -> str | None:
-    """The name of the environment whose rows ``--env`` keeps; a table says which names it has."""
-    return env_name(ref) if ref is not None and ref.endswith(".toml") else ref
+def row(text: str) -> str:
+    """A word of ``--rows``, with an environment's name in place of its file.
+
+    ``cart.toml.mass`` becomes ``cart.mass``. The table says which rows it has.
+
+    Raises:
+        UsageError, NotFound: a file that does not exist or is malformed.
+    """
+    path, suffix, knob = text.partition(".toml")
+    return f"{resolve(path + suffix).name}{knob}" if suffix else text
 
 
 def check_env(ref: str, learned: str, wanted: str | None) -> None:

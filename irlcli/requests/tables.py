@@ -20,19 +20,25 @@ class Choice(NamedTuple):
     table: str
     seeds: str | None = None
     methods: str | None = None
-    env: str | None = None
+    rows: str | None = None
     choose_penalty: str | None = None
     until: str | None = None
     only: str | None = None
     tag: str | None = None
     file: Path | None = None
 
+    def row_names(self) -> list[str] | None:
+        """What ``--rows`` lists. A path may hold spaces, so that only commas separate."""
+        if self.rows is None:
+            return None
+        return [arguments.row(word.strip()) for word in self.rows.split(",") if word.strip()]
+
     def words(self) -> list[str]:
         """The options that make the same choice of rows and runs on another command line."""
         listed = {
             "--seeds": self.seeds,
             "--methods": self.methods,
-            "--env": self.env,
+            "--rows": self.rows,
             "--choose-penalty": self.choose_penalty,
             "--experiments": self.file,
         }
@@ -56,7 +62,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         table,
         None if choice.methods is None else _words(choice.methods),
         None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
-        arguments.row_env(choice.env),
+        choice.row_names(),
     )
     until = PHASES[-1] if choice.until is None else choice.until
     if until not in PHASES:

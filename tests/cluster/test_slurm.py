@@ -332,7 +332,7 @@ def test_every_machine_with_its_own_mount_of_a_store_on_the_network(tmp_path, wh
 def test_a_time_limit_ends_in_a_checkpoint_and_another_turn(runs):
     """Six rounds of 9 s do not fit: after 30 of 60 s the job is warned."""
     arguments = ("--cluster", "slurm", "--time", "1", "--until", "experts")
-    errors = done(runs.table(*arguments, "--env", "lunar-lander", IRL_TEST_ROUND="9"))
+    errors = done(runs.table(*arguments, "--rows", "lunar-lander", IRL_TEST_ROUND="9"))
     assert "failed" not in errors
     assert min(runs.computed().values()) >= 2
     ids = Store(runs.store).ids()

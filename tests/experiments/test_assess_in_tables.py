@@ -52,7 +52,7 @@ def test_the_plan_names_the_bank(irl, tables, tmp_path):
 
 
 def test_gates_do_not_act_in_the_unseen_settings_with_anything_learned(irl, tmp_path):
-    line = ["plan", "gates", "--profile", "smoke", "--env", "lunar-lander", "--store", tmp_path]
+    line = ["plan", "gates", "--profile", "smoke", "--rows", "lunar-lander", "--store", tmp_path]
     steps = {s["name"] for s in json.loads(irl(*line, "--json").out)["steps"]}
     row = {name for name in steps if name.startswith(ROW)}
     learned = {name for name in row if "erm" in name or "bank" in name}

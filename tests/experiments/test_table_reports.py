@@ -18,7 +18,8 @@ from irlcli.store.manifest import encode_provenance
 ROOT = Path(__file__).parent.parent.parent
 SMALL = ["--set", "airl.total_steps=2048", "--set", "transfer.total_steps=1024"]
 SMALL += ["--set", "evaluation.episodes=2", "--set", "expert.total_steps=1024"]
-ROW = ["--env", "lunar-lander"]
+ENV = ["--env", "lunar-lander"]
+ROW = ["--rows", "lunar-lander"]
 # Table 1 without the measures that need many more policies.
 TABLES = """
 [table1]
@@ -40,13 +41,13 @@ def table_store(tmp_path_factory, run_irl):
         done = run_irl([*arguments, *common])
         assert done.code == 0, done.err
 
-    where = [*ROW, "--ood", "engine-power"]
+    where = [*ENV, "--ood", "engine-power"]
     for agent in ("--expert", "--random", "--idle"):
         irl("evaluate", agent, *where)
-    irl("collect-experts", *ROW, "--intervention", "engine-power", "--name", "demos")
-    irl("evaluate", "--expert", *ROW, "--intervention", "engine-power")
+    irl("collect-experts", *ENV, "--intervention", "engine-power", "--name", "demos")
+    irl("evaluate", "--expert", *ENV, "--intervention", "engine-power")
     for use in ("--ood", "--intervention"):
-        irl("evaluate", "--expert", "--trained-in", "engine-power", *ROW, use, "engine-power")
+        irl("evaluate", "--expert", "--trained-in", "engine-power", *ENV, use, "engine-power")
     for method in ("erm", "irm"):
         for seed in "01":
             name = f"{method}.{seed}"
@@ -175,7 +176,7 @@ def test_experts_are_evaluated_in_the_other_settings_too(report, irl, table_stor
         mean = cells.loc[("lunar-lander engine-power", "reused", measure), "mean"]
         assert mean == pytest.approx(values.mean(), rel=1e-5)
     # The command says whose expert it is where that is not the setting's own.
-    where = [*ROW, "--intervention", "engine-power", "--trained-in", "engine-power=1x"]
+    where = [*ENV, "--intervention", "engine-power", "--trained-in", "engine-power=1x"]
     small = ["--store", table_store, "--profile", "smoke", *SMALL]
     said = irl("evaluate", "--expert", *where, *small).err
     assert re.search(r"^expert +lunar-lander engine-power=1x ", said, re.M)
@@ -340,7 +341,7 @@ def test_a_profile_without_runs_is_no_table(report, irl, table_store):
         (["table1", "--seeds", "0,0"], "--seeds: 0 appears twice", "once"),
         (["table1", "--seeds", "0-4"], "--seeds '0-4' is not a list of seeds", "0,1,2,3,4"),
         (["table1", "--seeds", "-1"], "holds a negative seed", "0 or more"),
-        (["table1", "--env", "reacher"], "table1 has no row of 'reacher'", "ant, lunar-lander"),
+        (["table1", "--rows", "reacher"], "--rows: unknown 'reacher'", "lunar-lander.bounce"),
         (["table1", "demos"], "table1 takes no references", "found by their configuration"),
         (["figure2", "--seeds", "1"], "figure2 takes no --seeds", "omit --seeds"),
         (["experts", "--methods", "erm"], "experts takes no --methods", "omit --methods"),
@@ -403,7 +404,7 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
         ("idle", "idle_return"),
         ("random", "random_return"),
     ):
-        evaluated = irl("evaluate", f"--{agent}", *ROW, "--ood", "engine-power", *common)
+        evaluated = irl("evaluate", f"--{agent}", *ENV, "--ood", "engine-power", *common)
         (place,) = json.loads((Path(evaluated.out.split()[0]) / "summary.json").read_text())[
             "settings"
         ]
@@ -427,7 +428,7 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
 def test_no_experts(irl, tmp_path):
     empty = irl("report", "experts", *ROW, "--store", tmp_path / "runs")
     assert empty.code == 3 and "irl run experts" in empty.err
-    tabular = irl("report", "experts", "--env", "gridworld", "--store", tmp_path / "runs")
+    tabular = irl("report", "experts", "--rows", "gridworld", "--store", tmp_path / "runs")
     assert tabular.code == 2 and "gridworld" in tabular.err
     refused = irl("report", "experts", "--seeds", "0", "--store", tmp_path / "runs")
     assert refused.code == 2 and "--seeds" in refused.err
@@ -451,7 +452,7 @@ def test_an_intervention_without_held_out_values_has_experts(irl, table_store, t
 def test_baselines_alone_make_a_report(irl, tmp_path):
     """As after `make experts`: nobody has learned a reward yet."""
     common = ["--store", tmp_path / "runs", "--profile", "smoke", *SMALL]
-    assert irl("evaluate", "--idle", *ROW, "--ood", "bounce", *common).code == 0
+    assert irl("evaluate", "--idle", *ENV, "--ood", "bounce", *common).code == 0
     done = irl("report", "table1", *ROW, *common)
     assert done.code == 0, done.err
     points = pd.read_csv(Path(done.out.strip()) / "seeds.csv")
@@ -522,10 +523,8 @@ def test_make_passes_its_variables_on():
     assert "--store here " in commands("demo", "IRL_STORE=elsewhere", "STORE=here")[0]
     assert "--from settings " in commands("demo", "FROM=settings")[0]
     assert "--from" not in commands("demo", "FROM=no-such-directory")[0]
-    chosen = commands(
-        "figure3", "SEEDS=0 1", "METHODS=erm irm", "ENVIRONMENT=ant", "TAG=x", "JOBS=4"
-    )[-1]
-    for words in ('--seeds "0 1"', '--methods "erm irm"', "--env ant", "--tag x", "--jobs 4"):
+    chosen = commands("figure3", "SEEDS=0 1", "METHODS=erm irm", "ROWS=ant", "TAG=x", "JOBS=4")[-1]
+    for words in ('--seeds "0 1"', '--methods "erm irm"', "--rows ant", "--tag x", "--jobs 4"):
         assert f" {words} " in chosen
     assert chosen.endswith("--out results/x/figure3-ant")
     assert commands("experts", "RESULTS=docs/results/experts")[0].endswith(

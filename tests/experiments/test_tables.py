@@ -6,7 +6,7 @@ import pytest
 
 from irlcli.configs import load_config
 from irlcli.errors import UsageError
-from irlcli.experiments.tables import load_table, load_tables
+from irlcli.experiments.tables import load_table, load_tables, narrowed
 
 SOUND = """
 [defaults]
@@ -130,6 +130,18 @@ def test_a_mistake_is_named_with_its_file_and_field(tables, tmp_path, old, new, 
     assert hint in caught.value.hint
 
 
+def test_rows_are_of_an_environment_or_single():
+    table = load_table("table1")
+
+    def rows(*names):
+        return [str(row) for row in narrowed(table, rows=names).rows]
+
+    lander, ant = ("lunar-lander.bounce", "lunar-lander.engine-power"), ("ant.friction",)
+    assert rows("lunar-lander") == [*lander]
+    assert rows(*ant, "lunar-lander.engine-power") == [lander[1], *ant]
+    assert rows("lunar-lander", lander[0]) == [*lander]
+
+
 def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     def refused(*words):
         done = irl(*words, "--store", tmp_path / "runs")
@@ -142,8 +154,13 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     assert "unknown table 'tabel1'" in refused("plan", "tabel1")
     assert "did you mean 'table1'" in refused("run", "tabel1")
     assert "did you mean 'irm'" in refused("run", "table1", "--methods", "erm,imr")
-    assert "table1 has no row of 'reacher'" in refused("plan", "table1", "--env", "reacher")
-    assert "figure2 takes no --env" in refused("plan", "figure2", "--env", "ant")
+    assert "--rows: unknown 'reacher'" in refused("plan", "table1", "--rows", "reacher")
+    assert "lunar-lander.bounce" in refused("plan", "table1", "--rows", "lunar-lander.bonce")
+    assert "ant appears twice" in refused("plan", "table1", "--rows", "ant,ant")
+    assert "the list is empty" in refused("plan", "table1", "--rows", ",")
+    absent = irl("plan", "table1", "--rows", "cart.toml")
+    assert absent.code == 3 and "cart.toml" in absent.err
+    assert "figure2 takes no --rows" in refused("plan", "figure2", "--rows", "ant")
     assert "experts takes no --seeds" in refused("plan", "experts", "--seeds", "1")
     assert "did you mean 'rewards'" in refused("run", "table1", "--until", "reward")
     step = "smoke.lunar-lander.bounce.irm.0.transfr"

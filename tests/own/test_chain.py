@@ -147,14 +147,14 @@ def test_workers_make_the_same_bytes(bench):
 
 def test_the_experts_table_has_rows_of_own_environments(bench):
     plan = ("plan", "experts", "--profile", "smoke", "--json")
-    planned = bench.irl(*plan, "--env", "cart.toml")
+    planned = bench.irl(*plan, "--rows", "cart.toml")
     assert planned.code == 0, planned.err
     names = {step["name"] for step in json.loads(planned.out)["steps"]}
     wanted = [f"mass.expert.{x}" for x in ("1x", "2x", "4x")]
     wanted += [f"drag.expert.{x}" for x in ("0.1", "0.5", "1")]
     assert {f"smoke.cart.{step}" for step in wanted} <= names
     assert all(name.startswith("smoke.cart.") for name in names)
-    assert bench.irl(*plan, "--env", "carts").code == 2
+    assert bench.irl(*plan, "--rows", "carts").code == 2
 
 
 def test_planning_and_hits_load_nothing_heavy(bench):

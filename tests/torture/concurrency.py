@@ -217,7 +217,7 @@ def table_rows(work: Path) -> dict[str, int]:
     from irlcli.store import Store
 
     root = work / "rows"
-    line = [sys.executable, "-m", "irlcli", "run", "table1", "--env", "lunar-lander"]
+    line = [sys.executable, "-m", "irlcli", "run", "table1", "--rows", "lunar-lander"]
     line += ["--until", "returns", "--seeds", "0", "--methods", "erm,irm", "--jobs", "8"]
     line += ["--profile", "smoke", "--store", str(root)]
     environment = {**os.environ, "LD_PRELOAD": "", "PYTHONPATH": str(HERE.parent.parent)}
