@@ -95,13 +95,16 @@ def learned(config: Mapping[str, Any]) -> str:
     )
 
 
-def retrained(algorithm: Any = "ppo", ceiling: Any = None, from_student: bool = False) -> str:
-    """How a policy was retrained; empty for PPO from scratch on a reward without a ceiling."""
+def retrained(
+    algorithm: Any = "ppo", ceiling: Any = None, from_student: bool = False, restarts: Any = None
+) -> str:
+    """How a policy was retrained; empty for PPO, once, from scratch, on a reward without a ceiling."""
     return _joined(
         [
             "from the student" if from_student else None,
             f"by {algorithm}" if algorithm != "ppo" else None,
             f"under ceiling {_number(ceiling)}" if ceiling is not None else None,
+            f"best of {restarts}" if restarts else None,
         ]
     )
 
@@ -112,7 +115,10 @@ def retrained_as(record: KeyRecord) -> str:
     if not isinstance(config, dict):
         return ""
     return retrained(
-        config.get("algorithm", "ppo"), config.get("ceiling"), "start" in record.inputs
+        config.get("algorithm", "ppo"),
+        config.get("ceiling"),
+        "start" in record.inputs,
+        config.get("restarts"),
     )
 
 

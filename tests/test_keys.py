@@ -185,7 +185,8 @@ def cue_paid(config: Config, seed: int = 0) -> Request:
 
 
 RETRAINING = ["expert", "demonstrations", "airl", "transfer.algorithm", "transfer.ceiling"]
-RETRAINED = [*RETRAINING, "transfer.total_steps", "transfer.ppo"]
+FROM_SCRATCH = [*RETRAINING, "transfer.restarts", "transfer.total_steps"]
+RETRAINED = [*FROM_SCRATCH, "transfer.ppo"]
 # Stage to its request, and to the sections and fields that its key depends on.
 REQUESTS = {
     "train-expert": (expert, ["expert"]),
@@ -207,7 +208,7 @@ REQUESTS = {
     "transfer": (retrained, RETRAINED),
     "transfer by SAC": (
         by_sac,
-        [*RETRAINING[:3], "transfer.ceiling", "transfer.total_steps", "transfer.sac"],
+        [*(field for field in FROM_SCRATCH if field != "transfer.algorithm"), "transfer.sac"],
     ),
     "transfer from the student": (
         from_student,
@@ -281,6 +282,7 @@ CHANGED = {
     "airl.plateau_rounds": 3,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
+    "transfer.restarts": 3,
     "transfer.sac.tau": 0.1,
     "transfer.sac.ent_coef": 0.1,
     "maxent.penalty": "other",
@@ -513,6 +515,11 @@ def test_the_last_round_alone_is_in_no_key():
 def test_training_to_the_end_is_in_no_key():
     last = with_field(in_use(), "airl.select", "last")
     assert key(airl(last)) != key(airl(with_field(last, "airl.plateau_rounds", 10)))
+
+
+def test_one_restart_is_in_no_key():
+    one, two = (with_field(in_use(), "transfer.restarts", count) for count in (1, 2))
+    assert key(retrained(one)) == key(retrained(in_use())) != key(retrained(two))
 
 
 def test_no_warm_up_is_in_no_key():

@@ -163,14 +163,16 @@ def relevant_transfer(
 ) -> TransferConfig:
     """``transfer`` without what its algorithm and its start leave unused.
 
-    A policy that begins as the student has its network and its actions' deviation, and takes the
-    budget and the learning rate of ``transfer.from_student``.
+    A policy that begins as the student has its network and its actions' deviation, takes the
+    budget and the learning rate of ``transfer.from_student``, and has no restarts.
 
     Raises:
         UsageError: an unknown algorithm, or one or an option that does not fit the actions or the
             start.
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
+    if from_student or transfer.restarts == 1:
+        transfer = replace(transfer, restarts=UNSET)
     if transfer.algorithm == "sac":
         if discrete_actions:
             raise UsageError("SAC needs continuous actions", "--algorithm ppo")

@@ -138,6 +138,9 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         ceiling: every step's reward is at most this quantile of g on the demonstrations; None: g
             has no bound.
         from_student: replaces the budget and the learning rate with ``--start student``.
+        restarts: policies trained one after the other, each from other random weights and with the
+            whole budget. The one with the highest learned return is kept. Without effect with
+            ``--start student``.
     """
 
     algorithm: str = "ppo"
@@ -146,6 +149,7 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ppo: PPOConfig = PPOConfig()
     sac: SACConfig = SACConfig()
     from_student: FromStudentConfig = FromStudentConfig()
+    restarts: Count | UnsetType = UNSET
 
     @property
     def trained_by(self) -> PPOConfig | SACConfig:

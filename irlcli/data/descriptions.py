@@ -113,7 +113,8 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 
     ``settings`` are those the policy was trained in. A retrained policy also names the reward it
     was trained on (``method``, ``reward_seed``, ``reward_settings``) and how it was trained:
-    by which algorithm, under which ceiling, and whether it began as that reward's student.
+    by which algorithm, under which ceiling, whether it began as that reward's student, and, with
+    ``transfer.restarts``, what each restart earned of the learned reward.
     """
 
     agent: Agent
@@ -127,6 +128,7 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     algorithm: AlgorithmName = "ppo"
     ceiling: Quantile | None = None
     from_student: bool = False
+    restarts: tuple[Finite, ...] = ()
 
 
 class EnvironmentName(Struct, frozen=True, kw_only=True):
@@ -159,6 +161,7 @@ class Subject(Struct, frozen=True, kw_only=True):
     algorithm: AlgorithmName = "ppo"
     ceiling: Quantile | None = None
     from_student: bool = False
+    restarts: tuple[Finite, ...] = ()
 
 
 class LearnedReward(Struct, frozen=True, kw_only=True):

@@ -407,7 +407,9 @@ def _retrained(
     name += f".{cell.retraining}" if cell.retraining else ""
     yield Task(name, "transfers", moved)
     config = moved.parameters.transfer
-    how = labels.retrained(config.algorithm, config.ceiling, cell.measure == "from-student")
+    how = labels.retrained(
+        config.algorithm, config.ceiling, cell.measure == "from-student", config.restarts
+    )
     request = requests.returns(
         [place],
         moved,

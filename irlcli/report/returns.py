@@ -146,7 +146,9 @@ def agent_name(policy: Subject, setting: str) -> str:
         return f"expert of {', '.join(policy.settings)}"
     method = title(policy.method or "")
     if agent == "transfer":
-        how = labels.retrained(policy.algorithm, policy.ceiling, policy.from_student)
+        how = labels.retrained(
+            policy.algorithm, policy.ceiling, policy.from_student, len(policy.restarts)
+        )
         return f"{method} retrained policy" + (f" {how}" if how else "")
     if agent == "student":
         demonstrated = (parse_setting(policy.env, text) for text in policy.settings)

@@ -147,7 +147,9 @@ def _of_policy(
         check_observed(origin.env, scored_by.origin.settings, settings)
     label = f"{origin.agent} of {', '.join(origin.settings)}"
     if origin.method is not None:
-        how = labels.retrained(origin.algorithm, origin.ceiling, origin.from_student)
+        how = labels.retrained(
+            origin.algorithm, origin.ceiling, origin.from_student, len(origin.restarts)
+        )
         label = f"{origin.agent} {origin.method} {how}".strip() + f" of seed {origin.seed}"
     return stage.request(
         origin.env,

@@ -167,6 +167,21 @@ class Training:
         self.rounds_done = 0
         self.rows: list[Row] = []
 
+    @property
+    def policy(self) -> Policy:
+        """The current policy; after :meth:`run` the chosen round's."""
+        return self.trainer.policy
+
+    @property
+    def steps(self) -> int:
+        """Environment steps taken so far."""
+        return self.trainer.steps
+
+    @property
+    def planned_steps(self) -> int:
+        """Environment steps of all rounds."""
+        return self.trainer.rounds * self.trainer.steps_per_round
+
     def run(
         self,
         after_round: Callable[[Training, list[Row]], None],

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from irlcli.learners.frozen import FrozenReward
     from irlcli.learners.reward_model import RewardModule
     from irlcli.rl.loop import Row, Training
+    from irlcli.rl.restarts import Restarts
     from irlcli.trajectories import Trajectory
 
 
@@ -173,7 +174,7 @@ def environment_key(env: str, settings: Sequence[Setting] | None = None) -> Envi
     )
 
 
-def run_training(job: Job, training: Training) -> list[Row]:
+def run_training(job: Job, training: Training | Restarts) -> list[Row]:
     """Run ``training`` from the job's last checkpoint to the end; its rows.
 
     Reports every round to the job's console and offers it as a checkpoint.
@@ -195,15 +196,14 @@ def run_training(job: Job, training: Training) -> list[Row]:
         rows = tensors.byte_tensor(json.dumps(training.rows).encode())
         return tensors.to_bytes({"training": training.state_dict(), "rows": rows})
 
-    def after_round(_: Training, newest: list[Row]) -> None:
+    def after_round(_: Training | Restarts, newest: list[Row]) -> None:
         _report(job, training, newest)
         job.checkpoints.offer(encoded)
 
     rows = training.run(after_round, job.console.warn)
-    if training.rounds_done < training.trainer.rounds:
-        steps = training.trainer.steps
-        done = f"{training.rounds_done} of {training.trainer.rounds} rounds"
-        job.console.progress(steps, steps, "steps", {"ended after": done})
+    if training.steps < training.planned_steps:
+        done = f"{training.steps:,} of {training.planned_steps:,} steps"
+        job.console.progress(training.steps, training.steps, "steps", {"ended after": done})
     return rows
 
 
@@ -291,20 +291,21 @@ def summary_of(setting: str, trajectories: Sequence[Trajectory]) -> dict[str, An
     }
 
 
-def _report(job: Job, training: Training, newest: list[Row]) -> None:
+def _report(job: Job, training: Training | Restarts, newest: list[Row]) -> None:
     facts = {row["setting"]: shown(row["true_return"], row["progress"]) for row in newest}
+    if "restart" in newest[0]:
+        facts["restart"] = str(newest[0]["restart"] + 1)
     if "accuracy" in newest[0]:
         accuracy = sum(row["accuracy"] for row in newest) / len(newest)
         facts["discriminator"] = f"accuracy {accuracy:.2f}"
     if "challenger_return" in newest[0]:
         returns = [row["challenger_return"] for row in newest]
         facts["challenger"] = f"return {sum(returns) / len(returns):.0f}"
-    trainer = training.trainer
-    job.console.progress(trainer.steps, trainer.rounds * trainer.steps_per_round, "steps", facts)
+    job.console.progress(training.steps, training.planned_steps, "steps", facts)
     scalars = {
         f"{row['setting']}/{name}": float(value)
         for row in newest
         for name, value in row.items()
-        if name not in ("round", "steps", "setting")
+        if name not in ("restart", "round", "steps", "setting")
     }
-    job.console.scalars(trainer.steps, scalars)
+    job.console.scalars(training.steps, scalars)

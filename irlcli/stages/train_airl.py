@@ -81,6 +81,14 @@ def request(
             f"airl.averaged_rounds = {airl.averaged_rounds}, but training has {rounds} rounds",
             f"--set airl.averaged_rounds={rounds} or less",
         )
+    if airl.plateau_rounds and 2 * airl.plateau_rounds >= rounds:
+        raise UsageError(
+            f"airl.plateau_rounds = {airl.plateau_rounds} compares {2 * airl.plateau_rounds} rounds, but "
+            f"training has {rounds}: it could never end earlier",
+            f"--set airl.plateau_rounds={(rounds - 1) // 2} or less"
+            if rounds > 2
+            else "omit airl.plateau_rounds",
+        )
     if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
         raise UsageError(
             f"airl.batch_size = {airl.batch_size} cannot hold an even number of samples of each of "

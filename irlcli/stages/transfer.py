@@ -11,6 +11,7 @@ from irlcli.configs.relevance import relevant_transfer
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.seeds import derive
 from irlcli.stages.base import (
     EnvironmentKey,
     From,
@@ -21,6 +22,9 @@ from irlcli.stages.base import (
     environment_key,
     run_training,
 )
+
+# Of which the mean learned return chooses among restarts.
+SCORED_EPISODES = 100
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,20 +68,26 @@ def request(
     )
     label = f"transfer {env} {setting} seed {seed}"
     label += f" on the reward of {reward_label}" if reward_label else ""
-    how = labels.retrained(transfer.algorithm, transfer.ceiling, start is not None)
+    how = labels.retrained(
+        transfer.algorithm, transfer.ceiling, start is not None, parameters.transfer.restarts
+    )
     label += f" {how}" if how else ""
     inputs = {"reward": reward} | ({} if start is None else {"start": start})
     return Request(STAGE, parameters, inputs, label)
 
 
 def run(job: Job) -> None:
-    """Train on g / scale. The metrics report the true return, which the policy never sees."""
+    """Train on g / scale. The metrics report the true return, which neither training nor choice sees."""
+    import numpy as np
+
     from irlcli.data.outputs import write_metrics, write_policy
     from irlcli.data.tensors import load_policy_file, load_reward_file
     from irlcli.learners.frozen import FrozenReward
     from irlcli.rl import algorithm
     from irlcli.rl.loop import LastRound, NoLearner, Training
-    from irlcli.rl.policy import require_observations
+    from irlcli.rl.policy import Policy, require_observations
+    from irlcli.rl.restarts import Restarts
+    from irlcli.rl.rollout import roll_out
     from irlcli.rl.worlds import action_space, make_worlds, observation_size
 
     p: Parameters = job.parameters
@@ -109,19 +119,32 @@ def run(job: Job) -> None:
             actions=action_space(worlds.action_space),
             ceiling=p.transfer.ceiling,
         )
-        # Other moments of the observations would turn the student into another policy.
-        kept = {} if student is None else {"keep_moments": True}
-        trainer = algorithm(p.transfer.algorithm)(
-            worlds, config, p.transfer.total_steps, p.seed, STAGE.name, **kept
-        )
-        if student is not None:
-            require_observations(student, worlds.observation_space, where)
-            trainer.policy.load_state_dict(student.state_dict())
-        training = Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
+
+        def begin(restart: int) -> Training:
+            seed = derive(f"{STAGE.name} restart", p.seed, restart)[0] if restart else p.seed
+            # Other moments of the observations would turn the student into another policy.
+            kept = {} if student is None else {"keep_moments": True}
+            trainer = algorithm(p.transfer.algorithm)(
+                worlds, config, p.transfer.total_steps, seed, STAGE.name, **kept
+            )
+            if student is not None:
+                require_observations(student, worlds.observation_space, where)
+                trainer.policy.load_state_dict(student.state_dict())
+            return Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
+
+        def learned_return(policy: Policy) -> float:
+            found = roll_out(env, settings[0], policy, SCORED_EPISODES, p.seed, "restart score")
+            return float(np.mean([reward.of_episode(t) for t in found]))
+
+        training: Training | Restarts
+        if isinstance(p.transfer.restarts, msgspec.UnsetType):
+            training = begin(0)
+        else:
+            training = Restarts(begin, p.transfer.restarts, learned_return)
         rows = run_training(job, training)
     write_policy(
         job.output,
-        trainer.policy,
+        training.policy,
         config,
         env=env,
         agent="transfer",
@@ -133,6 +156,7 @@ def run(job: Job) -> None:
         algorithm=p.transfer.algorithm,
         ceiling=p.transfer.ceiling,
         from_student=student is not None,
+        restarts=tuple(training.scores) if isinstance(training, Restarts) else (),
     )
     write_metrics(job.output, rows)
 

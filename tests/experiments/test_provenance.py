@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import time
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import msgspec
@@ -200,8 +199,7 @@ class LongTraining:
 
     def __init__(self, rows: int):
         self.rows = [self.ROW] * rows
-        self.rounds_done = 1
-        self.trainer = SimpleNamespace(steps=1, rounds=1, steps_per_round=1)
+        self.steps = self.planned_steps = 1
 
     def state_dict(self) -> dict[str, Any]:
         return {"steps": 1}

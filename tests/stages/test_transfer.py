@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -174,3 +175,58 @@ def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
         assert done.code == 2 and done.out == ""
         error, told = done.err.strip().splitlines()
         assert message in error and hint in told
+
+
+RESTARTS = ["transfer", "--reward", "airl", "--ood", "friction", "--set", "transfer.restarts=3"]
+
+
+def test_the_restart_with_the_highest_learned_return_is_kept(runs, irl):
+    artefact = made(runs, irl(*RESTARTS, *common(runs), "--name", "best"))
+    about = json.loads((artefact.directory / "policy.json").read_text())
+    assert len(set(about["restarts"])) == 3
+    rows = pq.read_table(artefact.directory / "metrics.parquet").to_pylist()
+    assert {row["restart"] for row in rows} == {0, 1, 2}
+    first = made(runs, irl(*RESTARTS[:-2], *common(runs)))
+    policies = [
+        load_policy_file(made.directory / "policy.pt")[0].state_dict() for made in (first, artefact)
+    ]
+    same = all(torch.equal(policies[0][name], policies[1][name]) for name in policies[0])
+    assert same == (max(about["restarts"]) == about["restarts"][0])
+    score = irl("evaluate", "--policy", "best", "--reward", "airl", *common(runs))
+    assert score.code == 0 and "best of 3" in score.err
+    once = irl(*RESTARTS[:-1], "transfer.restarts=1", *common(runs), "--dry-run")
+    assert once.out.startswith("HIT")
+
+
+def test_restarts_killed_and_run_again_give_the_same_bytes(runs, tmp_path):
+    """Killed in its second restart, it resumes there."""
+    command = [sys.executable, "-m", "irlcli", *RESTARTS, "--profile", "smoke"]
+    whole = tmp_path / "whole"
+    shutil.copytree(runs, whole, symlinks=True)
+    subprocess.run([*command, "--store", whole], check=True, capture_output=True)
+    process = subprocess.Popen(
+        [*command, "--store", runs], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    for line in process.stderr:
+        if "restart 2" in line:
+            process.send_signal(signal.SIGINT)
+            break
+    process.communicate()
+    assert process.returncode == 130
+    done = subprocess.run([*command, "--store", runs], check=True, capture_output=True, text=True)
+    resumed = Store(runs).resolve(done.stdout.strip().rpartition("/")[2]).artefact
+    assert resumed.provenance()["resumed"] == 1
+    assert resumed.id in Store(whole).ids()
+
+
+def test_a_policy_that_begins_as_the_student_has_no_restarts(runs, irl):
+    student = ["transfer", "--reward", "airl", "--ood", "friction", "--start", "student"]
+    made(runs, irl(*student, *common(runs)))
+    again = irl(*student, *RESTARTS[-2:], *common(runs), "--dry-run")
+    assert again.out.startswith("HIT")
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "two", "1.5"])
+def test_a_bad_count_of_restarts_is_refused(runs, irl, count):
+    done = irl(*RESTARTS[:-1], f"transfer.restarts={count}", *common(runs))
+    assert done.code == 2 and "transfer.restarts" in done.err
