@@ -64,7 +64,11 @@ class Restarts:
         after_round: Callable[[Restarts, list[Row]], None],
         warn: Callable[[str], None],
     ) -> list[Row]:
-        """Train to the end of the last restart, put the best one's weights in place, return all rows."""
+        """Train to the end of the last restart and put the weights of the best one in place.
+
+        Returns:
+            All rows; ``kept`` says whether they are of the best restart.
+        """
         for index in range(self._index, self._count):
             if index > self._index:
                 self._past = self.rows
@@ -76,7 +80,8 @@ class Restarts:
                 self._best = copy.deepcopy(self.policy.state_dict())
             self.scores.append(score)
         self.policy.load_state_dict(self._best)
-        return self.rows
+        best = self.scores.index(max(self.scores))
+        return [row | {"kept": row["restart"] == best} for row in self.rows]
 
     def _numbered(self, rows: Sequence[Row]) -> list[Row]:
         return [{"restart": self._index} | row for row in rows]

@@ -4,11 +4,16 @@ Its inputs are evaluations and metrics, known by their content. What else it pri
 how long, at which commit) are parameters, so that equal requests give equal bytes.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Parameters
 from irlcli.stages.base import Job, Request, Source, Stage
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
@@ -82,7 +87,7 @@ def run(job: Job) -> None:
                 group[cell.agent, which] = returns["true_return"].to_numpy()
             shared.add((cell.row, cell.run))
     learning = {
-        role: pd.read_parquet(path)
+        role: _of_the_kept(pd.read_parquet(path))
         for role, path in job.inputs.items()
         if role.endswith("-learning")
     }
@@ -107,6 +112,11 @@ def run(job: Job) -> None:
     banks = scatter.draw_banks(job.output, p, assessments)
     curves = plots.learning_curves(p, learning)
     (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, banks, curves))
+
+
+def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
+    """The rows of the restart that was kept."""
+    return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
 STAGE = Stage("report", 13, run)

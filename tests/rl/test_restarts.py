@@ -48,6 +48,7 @@ def test_the_policy_with_the_highest_score_is_in_place(starts, best):
     rows = runs.run(lambda *_: None, pytest.fail)
     assert runs.policy.weight.item() == best
     assert runs.scores == [start + 2 for start in starts]
+    assert {row["weight"] for row in rows if row["kept"]} == {best - 1, best}
     assert [row["restart"] for row in rows] == sorted(2 * list(range(len(starts))))
     assert runs.steps == runs.planned_steps == 20 * len(starts)
 
