@@ -10,7 +10,8 @@ from benchmarks.peers.__main__ import enough, main
 from benchmarks.peers.checks import first_kept, share
 from benchmarks.peers.results import read_run, tables, until_text, write
 from benchmarks.peers.tasks import METHODS, ROWS, chosen, tasks
-from irlcli.errors import UsageError
+from irlcli.errors import Busy, UsageError
+from irlcli.store.lock import locked
 
 SETTINGS = {"lunar-lander.engine-power": ["engine-power=1x", "engine-power=1.25x"]}
 
@@ -117,6 +118,20 @@ def test_a_variable_horizon_is_only_tried_where_episodes_can_end():
     found = tasks({row: ["a", "b"] for row in ROWS}, list(METHODS), [1])
     variable = {task.row for task in found if task.method == "imitation-airl-variable"}
     assert variable == {"lunar-lander.engine-power"}
+
+
+def test_one_process_at_a_time(tmp_path, monkeypatch, capsys):
+    (tmp_path / "runs").mkdir()
+    unfinished = tmp_path / "runs" / "ours.part"
+    unfinished.touch()
+    monkeypatch.setattr(sys, "argv", ["peers", "--out", str(tmp_path)])
+    with (
+        locked(tmp_path / "runs" / ".lock"),
+        pytest.raises(SystemExit, match=str(Busy.exit_code)),
+    ):
+        main()
+    assert str(tmp_path / "runs") in capsys.readouterr().err
+    assert unfinished.exists()
 
 
 def test_names_are_checked():

@@ -13,6 +13,7 @@ import shlex
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,6 +27,7 @@ from irlcli.experiments.provenance import git_state
 from irlcli.experiments.references import demonstrations
 from irlcli.interventions import parse_settings
 from irlcli.store import Store
+from irlcli.store.lock import locked
 
 _ROOT = Path(__file__).parents[2]
 _ZOO = _ROOT / "zoo"
@@ -77,14 +79,21 @@ def _options() -> argparse.Namespace:
 
 
 def _run(options: argparse.Namespace) -> None:
+    runs = options.out / "runs"
+    runs.mkdir(parents=True, exist_ok=True)
+    # Two processes would delete each other's unfinished runs.
+    alone = locked(runs / ".lock", what=f"the runs in {runs}")
+    with nullcontext() if options.report else alone:
+        _run_in(runs, options)
+
+
+def _run_in(runs: Path, options: argparse.Namespace) -> None:
     settings = {}
     for row in options.rows:
         env, knob = row.split(".")
         values = ",".join(load_config(env).interventions[knob].id)
         settings[row] = [str(setting) for setting in parse_settings(env, f"{knob}={values}")]
     wanted = tasks(settings, options.methods, options.seeds)
-    runs = options.out / "runs"
-    runs.mkdir(parents=True, exist_ok=True)
     files = {task: runs / f"{task.name}.jsonl" for task in wanted}
     missing = [task for task in wanted if not enough(files[task], options.limit)]
     failed: list[str] = []
