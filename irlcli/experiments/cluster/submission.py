@@ -169,7 +169,7 @@ class Submission:
         ids = {self._ids[name] for name in alive}
         self._queue.cancel(ids)
         while self._signals < 2 and not ids.isdisjoint(self._queue.states()):
-            time.sleep(0.1)
+            time.sleep(0.5)
         self._plan.lookup.forget_missing()
         for name in alive:
             self._ended(name, last=False, since=running.get(name, time.monotonic()))
