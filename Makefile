@@ -30,12 +30,16 @@ STORE   ?= $(or $(IRL_STORE),runs)
 PROFILE ?= standard
 JOBS    ?= 2
 FROM    ?= zoo
-RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(addprefix -,$(ROWS))
+# ROWS with commas, and as part of names and directories.
+COMMA   := ,
+LISTED   = $(subst $(eval) ,$(COMMA),$(strip $(ROWS)))
+ROWNAME  = $(addprefix -,$(subst /,-,$(subst $(COMMA),-,$(LISTED))))
+RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(ROWNAME)
 
 IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
 CHOSEN   = --store $(STORE) --profile $(PROFILE) $(foreach place,$(FROM),$(addprefix --from ,$(if $(findstring ://,$(place)),$(place),$(wildcard $(place))))) $(SET) $(CHOOSE) \
-    $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --rows ,$(ROWS))
+    $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --rows ,$(LISTED))
 OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
 
@@ -89,8 +93,8 @@ experts figure2 control: $(READY)
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 
 report-%: $(READY)
-	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(addprefix -,$(ROWS)) \
-	    --out results/$(or $(TAG),$(PROFILE))/$*$(addprefix -,$(ROWS))
+	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(ROWNAME) \
+	    --out results/$(or $(TAG),$(PROFILE))/$*$(ROWNAME)
 
 # The values of settings/*.toml; needs no store.
 table2: $(READY)

@@ -68,6 +68,9 @@ def budget(parameters: Mapping[str, Any]) -> str:
             continue
         counts = found if isinstance(found, list | tuple) else [found]
         if counts and all(isinstance(count, int) for count in counts):
+            restarts = config.get("restarts") if isinstance(config, dict) else None
+            if isinstance(restarts, int):
+                counts = [count * restarts for count in counts]
             return _joined([", ".join(f"{count:,}" for count in counts), unit])
     return ""
 

@@ -283,6 +283,7 @@ CHANGED = {
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
     "transfer.restarts": 3,
+    "transfer.restart_episodes": 7,
     "transfer.sac.tau": 0.1,
     "transfer.sac.ent_coef": 0.1,
     "maxent.penalty": "other",
@@ -520,6 +521,10 @@ def test_training_to_the_end_is_in_no_key():
 def test_one_restart_is_in_no_key():
     one, two = (with_field(in_use(), "transfer.restarts", count) for count in (1, 2))
     assert key(retrained(one)) == key(retrained(in_use())) != key(retrained(two))
+    measured = with_field(two, "transfer.restart_episodes", 7)
+    assert key(retrained(measured)) != key(retrained(two))
+    default = with_field(two, "transfer.restart_episodes", 100)
+    assert key(retrained(default)) == key(retrained(two))
 
 
 def test_no_warm_up_is_in_no_key():

@@ -310,7 +310,7 @@ def _report(
         artefact = runner.run(request)
     finally:
         session.console.close()
-    name = "-".join([f"{found.selection.tag}.{choice.table}", *(choice.row_names() or ())])
+    name = choice.report_name(found.selection.tag)
     runner.name(name, artefact)
     if directory is not None:
         copy_outputs(session, artefact, directory)

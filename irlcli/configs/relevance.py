@@ -171,8 +171,10 @@ def relevant_transfer(
             start.
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
-    if from_student or transfer.restarts == 1:
-        transfer = replace(transfer, restarts=UNSET)
+    if from_student or transfer.restarts in (UNSET, 1):
+        transfer = replace(transfer, restarts=UNSET, restart_episodes=UNSET)
+    elif transfer.restart_episodes is UNSET:
+        transfer = replace(transfer, restart_episodes=100)
     if transfer.algorithm == "sac":
         if discrete_actions:
             raise UsageError("SAC needs continuous actions", "--algorithm ppo")

@@ -139,8 +139,9 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             has no bound.
         from_student: replaces the budget and the learning rate with ``--start student``.
         restarts: policies trained one after the other, each from other random weights and with the
-            whole budget. The one with the highest learned return is kept. Without effect with
-            ``--start student``.
+            whole budget. The one with the highest learned return is kept. ``--start student``
+            ignores it.
+        restart_episodes: over which the learned return of a restart is measured; 100 by default.
     """
 
     algorithm: str = "ppo"
@@ -150,6 +151,7 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     sac: SACConfig = SACConfig()
     from_student: FromStudentConfig = FromStudentConfig()
     restarts: Count | UnsetType = UNSET
+    restart_episodes: Count | UnsetType = UNSET
 
     @property
     def trained_by(self) -> PPOConfig | SACConfig:

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import msgspec
 
 from irlcli.configs.load import load_config, read_toml, settings_directory
-from irlcli.envs.registry import ENVIRONMENTS, environment, resolve
+from irlcli.envs.registry import ENVIRONMENTS, environment, is_known, resolve
 from irlcli.envs.spec import EnvironmentSpec
 from irlcli.errors import NotFound, UsageError, closest, suggest
 from irlcli.experiments.variants import read_variants
@@ -149,9 +149,11 @@ def narrowed(
     if rows is not None:
         offered = table.rows
         if table.kind == "experts":
-            own = {name.partition(".")[0] for name in rows} - {row.env for row in offered}
-            offered += _rows_of(*(environment(env) for env in sorted(own)))
+            own = {name.partition(".")[0] for name in rows} - {*ENVIRONMENTS}
+            offered += _rows_of(*(environment(env) for env in sorted(own) if is_known(env)))
         names = {name: None for row in offered for name in (row.env, str(row))}
+        if not rows:
+            raise UsageError("--rows: the list is empty", f"name some of: {', '.join(names)}")
         _check_list("--rows", rows, names)
         changes["rows"] = tuple(row for row in offered if {row.env, str(row)} & set(rows))
     return msgspec.structs.replace(table, **changes)

@@ -349,7 +349,7 @@ class Lab:
         *,
         seeds: int | Sequence[int] | None = None,
         methods: str | Sequence[str] | None = None,
-        rows: str | Sequence[str] | None = None,
+        rows: str | Path | Sequence[str | Path] | None = None,
         choose_penalty: Sequence[float] | str | None = None,
         until: str | None = None,
         only: str | None = None,

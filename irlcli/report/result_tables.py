@@ -352,7 +352,7 @@ def budgets(p: Parameters) -> Table:
                     ]
                 ),
                 config["airl"]["select"],
-                f"{config['transfer']['total_steps']:,}"
+                f"{config['transfer']['total_steps'] * config['transfer'].get('restarts', 1):,}"
                 if {"transfer", "transfer-id"} & set(p.measures)
                 else "-",
                 f"{config['transfer']['from_student']['total_steps']:,}"

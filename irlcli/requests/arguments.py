@@ -175,8 +175,8 @@ def row(text: str) -> str:
     Raises:
         UsageError, NotFound: a file that does not exist or is malformed.
     """
-    path, suffix, knob = text.partition(".toml")
-    return f"{resolve(path + suffix).name}{knob}" if suffix else text
+    file = re.fullmatch(r"(.*\.toml)(\.[^/.]+)?", text)
+    return text if file is None else resolve(file[1]).name + (file[2] or "")
 
 
 def check_env(ref: str, learned: str, wanted: str | None) -> None:

@@ -1,5 +1,6 @@
 """``plan`` and ``run``: a chosen part of a table of ``settings/experiments.toml``."""
 
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,9 @@ from irlcli.requests.session import StageSession
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.status import Step
+
+# In a name, which may have 100 characters in all.
+_LONGEST_ROWS = 50
 
 
 class Choice(NamedTuple):
@@ -28,10 +32,17 @@ class Choice(NamedTuple):
     file: Path | None = None
 
     def row_names(self) -> list[str] | None:
-        """What ``--rows`` lists. A path may hold spaces, so that only commas separate."""
+        """What ``--rows`` lists. Only commas separate, because a path may contain spaces."""
         if self.rows is None:
             return None
         return [arguments.row(word.strip()) for word in self.rows.split(",") if word.strip()]
+
+    def report_name(self, tag: str) -> str:
+        """The name of the report on this choice: ``standard.table1-ant``, say."""
+        rows = "-".join(sorted(self.row_names() or ()))
+        if len(rows) > _LONGEST_ROWS:
+            rows = hashlib.sha256(rows.encode()).hexdigest()[:8]
+        return f"{tag}.{self.table}" + (f"-{rows}" if rows else "")
 
     def words(self) -> list[str]:
         """The options that make the same choice of rows and runs on another command line."""
@@ -79,7 +90,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     session.table_file = table.settings
     selection = Selection(tag, candidates, until, choice.only)
     plan = Plan(table, selection, session.config, session.runner().lookup())
-    for name in plan.tasks:
+    for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
 

@@ -33,10 +33,13 @@ class Restarts:
         self._past: list[Row] = []
         self._best: dict[str, Any] = {}
         self.scores: list[float] = []
-        self._start(0)
+        self._index = 0
+        self._training = begin(0)
 
     def _start(self, index: int) -> None:
         self._index = index
+        # Before the next one takes its memory.
+        del self._training
         self._training = self._begin(index)
 
     @property

@@ -81,12 +81,16 @@ def request(
             f"airl.averaged_rounds = {airl.averaged_rounds}, but training has {rounds} rounds",
             f"--set airl.averaged_rounds={rounds} or less",
         )
-    if airl.plateau_rounds and 2 * airl.plateau_rounds >= rounds:
+    relevant = relevant_airl(airl, environment(env).discrete_actions)
+    # Rounds that the plateau can be found in, before the last.
+    compared = rounds - 1 - relevant.penalty_warmup_rounds - relevant.penalty_ramp_rounds
+    if airl.plateau_rounds and 2 * airl.plateau_rounds > compared:
+        largest = compared // 2
         raise UsageError(
-            f"airl.plateau_rounds = {airl.plateau_rounds} compares {2 * airl.plateau_rounds} rounds, but "
-            f"training has {rounds}: it could never end earlier",
-            f"--set airl.plateau_rounds={(rounds - 1) // 2} or less"
-            if rounds > 2
+            f"airl.plateau_rounds = {airl.plateau_rounds} needs {2 * airl.plateau_rounds} rounds "
+            f"before the last, after lambda has its full value: training has {max(compared, 0)}",
+            f"--set airl.plateau_rounds={largest} or less"
+            if largest > 0
             else "omit airl.plateau_rounds",
         )
     if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
@@ -99,7 +103,7 @@ def request(
         environment=environment_key(env, settings),
         settings=texts,
         seed=seed,
-        airl=relevant_airl(airl, environment(env).discrete_actions),
+        airl=relevant,
     )
     check_risks(parameters.airl.penalty, parameters.airl.grouping, trained)
     label = f"train-airl {describe(parameters.airl)} {env} {', '.join(texts)} seed {seed}"

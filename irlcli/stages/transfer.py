@@ -23,9 +23,6 @@ from irlcli.stages.base import (
     run_training,
 )
 
-# Of which the mean learned return chooses among restarts.
-SCORED_EPISODES = 100
-
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What a retrained policy depends on, besides the reward."""
@@ -133,14 +130,19 @@ def run(job: Job) -> None:
             return Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
 
         def learned_return(policy: Policy) -> float:
-            found = roll_out(env, settings[0], policy, SCORED_EPISODES, p.seed, "restart score")
+            job.console.progress(
+                training.steps, training.planned_steps, "steps", {"measuring": "learned return"}
+            )
+            found = roll_out(env, settings[0], policy, episodes, p.seed, "restart score")
+            job.warn_of_errors(p.setting, found)
             return float(np.mean([reward.of_episode(t) for t in found]))
 
         training: Training | Restarts
-        if isinstance(p.transfer.restarts, msgspec.UnsetType):
+        restarts, episodes = p.transfer.restarts or 1, p.transfer.restart_episodes or 0
+        if restarts == 1:
             training = begin(0)
         else:
-            training = Restarts(begin, p.transfer.restarts, learned_return)
+            training = Restarts(begin, restarts, learned_return)
         rows = run_training(job, training)
     write_policy(
         job.output,

@@ -21,7 +21,7 @@ BOUNCE = "--intervention bounce=0.1"
         "evaluate --idle --env lunarlander",
         f"evaluate --expert --env lunarlander {BOUNCE}",
         "evaluate --idle --reward airl --env lunarlander",
-        *(f"{command} table1 --env lunarlander" for command in ("plan", "run", "report")),
+        *(f"{command} table1 --rows lunarlander" for command in ("plan", "run", "report")),
     ],
 )
 def test_a_mistyped_environment_is_suggested_by_every_command(irl, smoke_store, line):

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from irlcli.data.tensors import load_policy_file
+from irlcli.learners.frozen import FrozenReward
 from irlcli.store import Store
 
 
@@ -180,27 +181,44 @@ def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
 RESTARTS = ["transfer", "--reward", "airl", "--ood", "friction", "--set", "transfer.restarts=3"]
 
 
-def test_the_restart_with_the_highest_learned_return_is_kept(runs, irl):
-    artefact = made(runs, irl(*RESTARTS, *common(runs), "--name", "best"))
+def test_the_restart_with_the_highest_learned_return_is_kept(runs, irl, monkeypatch):
+    """Two episodes measure each restart; only the learned return of an episode is looked at."""
+    paid = iter([1.0, 1.0, 5.0, 7.0, 3.0, 3.0])
+    with monkeypatch.context() as patch:
+        patch.setattr(FrozenReward, "of_episode", lambda *_: next(paid))
+        artefact = made(runs, irl(*RESTARTS, *common(runs), "--name", "best"))
     about = json.loads((artefact.directory / "policy.json").read_text())
-    assert len(set(about["restarts"])) == 3
+    assert about["restarts"] == [1.0, 6.0, 3.0]
     rows = pq.read_table(artefact.directory / "metrics.parquet").to_pylist()
-    assert {row["restart"] for row in rows} == {0, 1, 2}
-    first = made(runs, irl(*RESTARTS[:-2], *common(runs)))
-    policies = [
-        load_policy_file(made.directory / "policy.pt")[0].state_dict() for made in (first, artefact)
-    ]
-    same = all(torch.equal(policies[0][name], policies[1][name]) for name in policies[0])
-    assert same == (max(about["restarts"]) == about["restarts"][0])
+    assert {(row["restart"], row["kept"]) for row in rows} == {(0, False), (1, True), (2, False)}
     score = irl("evaluate", "--policy", "best", "--reward", "airl", *common(runs))
     assert score.code == 0 and "best of 3" in score.err
+    assert "6,144 steps" in irl("ls", "--store", runs).out
+
+
+def test_one_restart_is_the_policy_without(runs, irl):
+    plain = made(runs, irl(*RESTARTS[:-2], *common(runs)))
     once = irl(*RESTARTS[:-1], "transfer.restarts=1", *common(runs), "--dry-run")
     assert once.out.startswith("HIT")
+    with_two = made(runs, irl(*RESTARTS[:-1], "transfer.restarts=2", *common(runs)))
+    policies = [
+        load_policy_file(one.directory / "policy.pt")[0].state_dict() for one in (plain, with_two)
+    ]
+    paid = json.loads((with_two.directory / "policy.json").read_text())["restarts"]
+    same = all(torch.equal(policies[0][name], policies[1][name]) for name in policies[0])
+    assert paid[0] != paid[1] and same == (paid[0] > paid[1])
+
+
+def test_sac_restarts(runs, irl):
+    artefact = made(runs, irl(*SAC, *RESTARTS[-2:-1], "transfer.restarts=2", *common(runs)))
+    about = json.loads((artefact.directory / "policy.json").read_text())
+    assert about["network"]["squashed"] and len(about["restarts"]) == 2
 
 
 def test_restarts_killed_and_run_again_give_the_same_bytes(runs, tmp_path):
     """Killed in its second restart, it resumes there."""
-    command = [sys.executable, "-m", "irlcli", *RESTARTS, "--profile", "smoke"]
+    longer = ["--set", "transfer.total_steps=8192"]
+    command = [sys.executable, "-m", "irlcli", *RESTARTS, *longer, "--profile", "smoke"]
     whole = tmp_path / "whole"
     shutil.copytree(runs, whole, symlinks=True)
     subprocess.run([*command, "--store", whole], check=True, capture_output=True)
