@@ -14,6 +14,7 @@ import torch
 
 from irlcli.data.tensors import load_policy_file
 from irlcli.learners.frozen import FrozenReward
+from irlcli.rl.ppo import PPOTrainer
 from irlcli.store import Store
 
 
@@ -90,8 +91,6 @@ def test_sac_killed_and_run_again_gives_the_same_bytes(runs, tmp_path):
 @pytest.mark.parametrize("words", [["--start", "student"], ["--start", "student", "--seed", "3"]])
 def test_the_retrained_policy_begins_as_the_student(runs, irl, words, monkeypatch):
     """Its first actions are the student's, before any update; its moments stay."""
-    from irlcli.rl.ppo import PPOTrainer
-
     first = {}
     original = PPOTrainer.train_round
 
@@ -215,26 +214,25 @@ def test_sac_restarts(runs, irl):
     assert about["network"]["squashed"] and len(about["restarts"]) == 2
 
 
-def test_restarts_killed_and_run_again_give_the_same_bytes(runs, tmp_path):
-    """Killed in its second restart, it resumes there."""
-    longer = ["--set", "transfer.total_steps=8192"]
-    command = [sys.executable, "-m", "irlcli", *RESTARTS, *longer, "--profile", "smoke"]
-    whole = tmp_path / "whole"
-    shutil.copytree(runs, whole, symlinks=True)
-    subprocess.run([*command, "--store", whole], check=True, capture_output=True)
-    process = subprocess.Popen(
-        [*command, "--store", runs], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    for line in process.stderr:
-        if "restart 2" in line:
-            process.send_signal(signal.SIGINT)
-            break
-    process.communicate()
-    assert process.returncode == 130
-    done = subprocess.run([*command, "--store", runs], check=True, capture_output=True, text=True)
-    resumed = Store(runs).resolve(done.stdout.strip().rpartition("/")[2]).artefact
+def test_restarts_interrupted_and_run_again_give_the_same_bytes(runs, irl, tmp_path, monkeypatch):
+    """Interrupted in its second restart, of two rounds, it resumes there."""
+    line = [*RESTARTS, "--set", "transfer.total_steps=4096"]
+    whole = shutil.copytree(runs, tmp_path / "whole", symlinks=True)
+    expected = made(whole, irl(*line, *common(whole)))
+    original, rounds = PPOTrainer.train_round, []
+
+    def interrupted(self, index, source):
+        rounds.append(index)
+        if len(rounds) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(self, index, source)
+
+    monkeypatch.setattr(PPOTrainer, "train_round", interrupted)
+    assert irl(*line, *common(runs)).code == 130
+    resumed = made(runs, irl(*line, *common(runs)))
+    assert rounds == [0, 1, 0, 1, 0, 1]
     assert resumed.provenance()["resumed"] == 1
-    assert resumed.id in Store(whole).ids()
+    assert resumed.id == expected.id
 
 
 def test_a_policy_that_begins_as_the_student_has_no_restarts(runs, irl):
