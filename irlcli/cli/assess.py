@@ -91,7 +91,8 @@ def assess(
         print_assessment(found(artefacts[0]))
         if not any(policies.retrained.values()):
             line = session.suggestion("transfer", "--reward", reward, "--setting", str(settings[0]))
-            out.print_note(f"No policy was retrained on this reward here: `{line}`")
+            places = ", ".join(map(str, settings))
+            out.print_note(f"No policy was retrained on this reward in {places}: `{line}` does it")
 
 
 def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[str, ...]]":
