@@ -11,7 +11,6 @@ from irlcli.configs.relevance import relevant_transfer
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
-from irlcli.seeds import derive
 from irlcli.stages.base import (
     EnvironmentKey,
     From,
@@ -86,6 +85,7 @@ def run(job: Job) -> None:
     from irlcli.rl.restarts import Restarts
     from irlcli.rl.rollout import roll_out
     from irlcli.rl.worlds import action_space, make_worlds, observation_size
+    from irlcli.seeds import derive
 
     p: Parameters = job.parameters
     env, config, where = (

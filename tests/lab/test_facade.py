@@ -102,12 +102,12 @@ def test_tables_are_data_frames(lab, irl, store_copy):
 
 
 def test_a_plan_says_what_irl_plan_says(lab, irl):
-    choice = {"seeds": [0], "methods": ["irm"], "env": "lunar-lander"}
+    choice = {"seeds": [0], "methods": ["irm"], "rows": "lunar-lander"}
     new = lab.store.parent / "new"
     assert set(irlcli.Lab(new).plan("table1", **choice).counts) == {"RUN", "BLOCKED"}
     assert not new.exists()
     steps = lab.plan("table1", **choice).to_pandas().set_index("name")["status"]
-    line = ["--seeds", "0", "--methods", "irm", "--env", "lunar-lander", "--profile", "smoke"]
+    line = ["--seeds", "0", "--methods", "irm", "--rows", "lunar-lander", "--profile", "smoke"]
     shown = irl("plan", "table1", *line, "--store", lab.store).out
     assert [line.split()[0] for line in shown.splitlines()] == steps.tolist()
 

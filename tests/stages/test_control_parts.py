@@ -86,7 +86,7 @@ def test_bad_input_is_one_line_that_says_what_is_allowed(irl, tmp_path, setting,
 
 
 def test_rows_methods_and_seeds_are_those_of_the_settings_file(irl, tmp_path):
-    for option in (["--seeds", "1"], ["--methods", "erm"], ["--env", "ant"]):
+    for option in (["--seeds", "1"], ["--methods", "erm"], ["--rows", "ant"]):
         done = irl("plan", "control", *option, "--store", tmp_path / "runs")
         assert done.code == 2 and f"control takes no {option[0]}" in done.err
 
