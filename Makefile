@@ -30,10 +30,10 @@ STORE   ?= $(or $(IRL_STORE),runs)
 PROFILE ?= standard
 JOBS    ?= 2
 FROM    ?= zoo
-# ROWS with commas, and as part of names and directories.
+# ROWS with commas, and, sorted as irl does, as part of names and directories.
 COMMA   := ,
 LISTED   = $(subst $(eval) ,$(COMMA),$(strip $(ROWS)))
-ROWNAME  = $(addprefix -,$(subst /,-,$(subst $(COMMA),-,$(LISTED))))
+ROWNAME  = $(addprefix -,$(subst /,-,$(subst $(eval) ,-,$(sort $(subst $(COMMA), ,$(ROWS))))))
 RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(ROWNAME)
 
 IRL     := $(VENV)/bin/irl

@@ -18,6 +18,8 @@ from irlcli.rl import ALGORITHMS
 _PPO = PPOConfig()
 _AIRL = AIRLConfig()
 _MAXENT = MaxEntConfig()
+# Not the field's default, which would be in the key of every retrained policy.
+_RESTART_EPISODES = 100
 _TRANSFER = TransferConfig()
 # What a policy that begins as the student takes from it.
 _OF_THE_STUDENT = (
@@ -174,7 +176,7 @@ def relevant_transfer(
     if from_student or transfer.restarts in (UNSET, 1):
         transfer = replace(transfer, restarts=UNSET, restart_episodes=UNSET)
     elif transfer.restart_episodes is UNSET:
-        transfer = replace(transfer, restart_episodes=100)
+        transfer = replace(transfer, restart_episodes=_RESTART_EPISODES)
     if transfer.algorithm == "sac":
         if discrete_actions:
             raise UsageError("SAC needs continuous actions", "--algorithm ppo")
