@@ -220,7 +220,11 @@ def print_json(kind: str, value: Mapping[str, Any]) -> None:
 def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", stderr: bool = False
 ) -> None:
-    """A table; plain text with aligned columns if the stream is not a terminal."""
+    """A table; plain text with aligned columns if the stream is not a terminal.
+
+    On a terminal cells are wrapped between words. Where the words are too wide, each row becomes a
+    block of lines: no number, id or name is ever cut.
+    """
     stream = sys.stderr if stderr else sys.stdout
     rows = [[printable(str(cell)) for cell in row] for row in rows]
     if not stream.isatty():
@@ -235,12 +239,47 @@ def print_table(
     from rich.table import Table
     from rich.text import Text
 
+    terminal = Console(stderr=stderr)
+    fitting = _widths(columns, rows, terminal.width)
+    if fitting is None:
+        _write("\n".join([*([title] if title else []), *_blocks(columns, rows)]), stream)
+        return
     table = Table(title=title or None, title_justify="left")
-    for column in columns:
-        table.add_column(column)
+    for column, width in zip(columns, fitting, strict=True):
+        table.add_column(Text(column), width=width)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console(stderr=stderr).print(table)
+    terminal.print(table)
+
+
+def _widths(columns: Sequence[str], rows: Sequence[Sequence[str]], total: int) -> list[int] | None:
+    """The width of each column in a table as wide as ``total``; None if a word would be cut."""
+    cells = list(zip(columns, *rows, strict=True))
+    widths = [max(len(word) for cell in of for word in cell.split() or [""]) for of in cells]
+    # A border before each cell and after the last, and a space on either side of each.
+    spare = total - 3 * len(columns) - 1 - sum(widths)
+    if spare < 0:
+        return None
+    for index, of in enumerate(cells):
+        wider = min(spare, max(map(len, of)) - widths[index])
+        widths[index] += wider
+        spare -= wider
+    return widths
+
+
+def _blocks(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A block of lines for each row: its heads, then its other cells, each beside its column.
+
+    The heads are the first cell and those of columns without a name.
+    """
+    margin = max(map(len, columns))
+    lines = []
+    for row in rows:
+        named = list(zip(columns, row, strict=True))
+        heads = [cell for name, cell in [("", row[0]), *named[1:]] if not name]
+        lines.append("  ".join(heads).rstrip())
+        lines += [f"  {n.ljust(margin)}  {cell}" for n, cell in named[1:] if n and cell]
+    return lines
 
 
 def print_error(error: IrlError, as_json: bool) -> None:

@@ -97,8 +97,7 @@ def _points(p: Parameters, report: Report) -> plt.Figure:
         for axis, row in zip(line, p.rows, strict=True):
             _panel(axis, p, report, row, measure)
         line[0].set_ylabel(f"true return, {measure}")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    _add_legend(figure, axes[0, 0])
     return figure
 
 
@@ -208,6 +207,13 @@ def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> plt.
         axis.set_title(setting)
     for axis in axes[-1]:
         axis.set_xlabel("million steps")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    _add_legend(figure, axes[0, 0])
     return figure
+
+
+def _add_legend(figure: plt.Figure, axis: plt.Axes) -> None:
+    """One legend for all panels, below them, in as many columns as the figure is wide enough for."""
+    handles, labels = axis.get_legend_handles_labels()
+    # An entry takes up to 1.8 inches; the layout cuts what does not fit.
+    columns = max(1, min(6, int(figure.get_figwidth() / 1.8)))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)

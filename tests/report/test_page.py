@@ -4,6 +4,7 @@ import json
 import re
 from html.parser import HTMLParser
 
+import matplotlib.pyplot as plt
 import pandas as pd
 import pytest
 from msgspec.structs import replace
@@ -109,6 +110,19 @@ def test_every_seed_is_plotted(tmp_path, method):
     assert (tmp_path / "table1.png").stat().st_size and (tmp_path / "table1.pdf").stat().st_size
     again = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
     assert again == svg
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("methods", [("erm", "irm"), ("erm", "irm", "erm-balanced")])
+def test_nothing_reaches_the_edge_of_a_picture(tmp_path, rows, methods):
+    """What is cut off, as a legend that is too wide, leaves ink in the outermost pixels."""
+    full = example(complete())[0]
+    p, points = example(complete(), rows=full.rows[:rows], methods=methods)
+    plots.draw_points(tmp_path, p, build(p, points, {}, {}))
+    image = plt.imread(tmp_path / "table1.png")[..., :3]
+    edges = [image[0], image[-1], image[:, 0], image[:, -1]]
+    assert all((edge == 1.0).all() for edge in edges)
+    assert (image < 1.0).any()
 
 
 def test_the_student_in_distribution_is_plotted_if_nothing_else_is_measured(tmp_path):
