@@ -31,6 +31,8 @@ class PlainJobs:
             self._console.warn(f"{name}: {text.removeprefix('warning: ')}")
         elif text.startswith("WAIT "):
             self._console.say(f"WAIT {name}: {text.rpartition(': ')[2]}")
+        elif text.startswith("RESUME "):
+            self._console.say(f"RESUME {name} from its checkpoint")
         elif text.startswith("  ") and self._is_due(name):
             self._console.say(f"  {name}: {text.rpartition(': ')[2]}")
 

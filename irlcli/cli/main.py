@@ -80,10 +80,12 @@ def _usage(error: Any) -> UsageError:
     message = error.format_message().replace("\n", " ").rstrip(".")
     message = re.sub("a valid int(eger)?( range)?$", "a whole number", message)
     message = re.sub("a valid float( range)?$", "a number", message)
-    message = re.sub(
-        r"^Got unexpected extra argument.*? \((.*)\)$", r"Unexpected argument: \1", message
-    )
-    return UsageError(message[0].lower() + message[1:], f"`{path} --help` lists the options")
+    extra = re.match(r"^Got unexpected extra argument.*? \((.*)\)$", message)
+    hint = f"`{path} --help` lists the options"
+    if extra:
+        message = f"Unexpected argument: {extra[1]}"
+        hint = f"write a list with commas and without spaces, as in --seeds 0,1; {hint}"
+    return UsageError(message[0].lower() + message[1:], hint)
 
 
 def _fail(error: IrlError) -> None:

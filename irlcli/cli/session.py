@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,21 @@ from irlcli.store import Artefact
 if TYPE_CHECKING:
     from irlcli.experiments.runner import Step
     from irlcli.stages.base import Request
+
+
+# The sections of a config that a stage's parameters may come from. Challengers learn as retrained
+# policies do, clones have the student's network, and a bank is looked for under the whole config.
+_SECTIONS = {
+    "train-expert": {"expert"},
+    "collect-experts": {"demonstrations", "gridworld"},
+    "train-airl": {"airl", "transfer"},
+    "choose-penalty": {"airl", "transfer", "evaluation"},
+    "clone": {"airl", "transfer", "clone"},
+    "train-maxent": {"maxent", "gridworld"},
+    "transfer": {"transfer"},
+    "evaluate": {"evaluation"},
+    "import": set[str](),
+}
 
 
 class Session(base.Session):
@@ -108,6 +123,7 @@ class StageSession(base.StageSession):
         Returns:
             the artefacts; none with ``--dry-run``.
         """
+        self._warn_of_unread(requests)
         if self.dry_run:
             if name is not None:
                 self.store.check_name(name)
@@ -118,6 +134,18 @@ class StageSession(base.StageSession):
         for artefact in artefacts:
             self.print_artefact(artefact, name, details)
         return artefacts
+
+    def _warn_of_unread(self, requests: Sequence["Request"]) -> None:
+        """Warn of a ``--set`` that none of the stages behind ``requests`` reads."""
+        stages = {stage for request in requests for stage in _stages(request)}
+        if not stages <= _SECTIONS.keys():
+            return
+        read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
+        for item in self.overrides:
+            if item.partition(".")[0].strip() not in read:
+                self.console.warn(
+                    f"--set {item} changes nothing: it is read by no stage of this command"
+                )
 
     def prepare(self, request: "Request", then: str) -> Artefact | None:
         """The artefact of ``request``, not printed.
@@ -160,3 +188,13 @@ class StageSession(base.StageSession):
             "outputs": [output.path for output in artefact.manifest.outputs],
         }
         out.print_json("artefact", document | dict(details(artefact) if details else {}))
+
+
+def _stages(request: "Request") -> Iterator[str]:
+    """The names of the stages that make ``request`` and what it needs."""
+    from irlcli.stages.base import From
+
+    yield request.stage.name
+    for source in request.inputs.values():
+        if isinstance(source, From):
+            yield from _stages(source.request)

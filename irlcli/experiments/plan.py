@@ -146,7 +146,8 @@ class Plan:
             close = closest(only, everything.tasks)
             hint = f"did you mean {close!r}? " if close else ""
             raise UsageError(
-                f"{self.table.name} has no step {only!r}", f"{hint}`irl plan` lists the names"
+                f"{self.table.name} has no step {only!r}",
+                f"{hint}`irl plan {self.table.name}` lists the names",
             )
         kept, pending = set(), [only]
         while pending:

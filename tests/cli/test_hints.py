@@ -141,3 +141,38 @@ def test_the_command_that_trains_a_missing_expert_can_be_typed_as_it_stands(irl,
     (command,) = re.findall(r"`irl ([^`]*)` trains it", told)
     assert irl(*command.split(), "--quiet").code == 0
     assert "trains it" not in irl(*assess).err
+
+
+POWER = "--env lunar-lander --intervention engine-power=1x"
+
+
+@pytest.mark.parametrize(
+    ("line", "item", "unread"),
+    [
+        ("transfer --reward airl --ood 1.5x", "airl.penalty_weight=3", True),
+        ("transfer --reward airl --ood 1.5x", "transfer.ceiling=0.5", False),
+        ("evaluate --policy moved --ood 1.5x", "airl.penalty_weight=3", True),
+        (f"evaluate --idle {POWER}", "expert.total_steps=9999", True),
+        (f"evaluate --expert {POWER}", "expert.total_steps=9999", False),
+        (f"collect-experts {POWER}", "transfer.ceiling=0.5", True),
+        (f"collect-experts {POWER}", "expert.total_steps=9999", False),
+        ("train-airl --demos demos --method irm", "transfer.ppo.gamma=0.9", False),
+        ("train-airl --demos demos --method irm", "expert.total_steps=9999", True),
+        ("assess airl", "expert.total_steps=9999", False),
+    ],
+)
+def test_a_field_that_no_stage_of_the_command_reads_is_named(irl, smoke_store, line, item, unread):
+    done = irl(*line.split(), "--set", item, *SMOKE, "--store", smoke_store.path, "--dry-run")
+    assert done.code == 0
+    assert (f"warning: --set {item} changes nothing" in done.err) == unread
+
+
+def test_a_list_with_spaces_is_explained(irl, empty_store):
+    done = irl("plan", "table1", "--rows", "ant", "lunar-lander", "--store", empty_store.root)
+    assert done.code == 2 and "lunar-lander" in done.err
+    assert "commas" in done.err.splitlines()[-1]
+
+
+def test_a_tag_that_cannot_begin_a_name_is_named(irl, empty_store):
+    done = irl("plan", "demo", "--tag", "a b", "--store", empty_store.root)
+    assert done.code == 2 and "--tag 'a b'" in done.err

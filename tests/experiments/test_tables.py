@@ -169,7 +169,7 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     )
     assert "--tag NAME" in refused("run", "table1", "--set", "airl.penalty_weight=3")
     for command in ("plan", "run"):
-        assert "cannot be a name" in refused(command, "table1", "--tag", "a b")
+        assert "cannot begin a name" in refused(command, "table1", "--tag", "a b")
     assert "the list is empty" in refused("plan", "table1", "--methods", "")
     assert "unknown --until ''" in refused("plan", "table1", "--until", "")
     (tmp_path / "file").touch()
