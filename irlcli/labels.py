@@ -93,9 +93,15 @@ def learned(config: Mapping[str, Any]) -> str:
             "from a clone" if config.get("bc_epochs") else None,
             f"mean of {rounds} rounds" if (rounds := config.get("averaged_rounds")) else None,
             "to a plateau" if config.get("plateau_rounds") else None,
-            "with challengers" if isinstance(challenger, dict) and challenger.get("life") else None,
+            _challenged(challenger) if isinstance(challenger, dict) else None,
         ]
     )
+
+
+def _challenged(challenger: Mapping[str, Any]) -> str | None:
+    if not challenger.get("life"):
+        return None
+    return "with mixed challengers" if challenger.get("mixed_share") else "with challengers"
 
 
 def retrained(

@@ -280,6 +280,7 @@ CHANGED = {
     "airl.columns": (-1,),
     "airl.averaged_rounds": 3,
     "airl.plateau_rounds": 3,
+    "airl.challenger.mixed_share": 0.5,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
     "transfer.restarts": 3,
@@ -511,6 +512,12 @@ def test_the_last_round_alone_is_in_no_key():
     last = with_field(in_use(), "airl.select", "last")
     one, three = (with_field(last, "airl.averaged_rounds", rounds) for rounds in (1, 3))
     assert key(airl(one)) == key(airl(last)) != key(airl(three))
+
+
+def test_unmixed_challengers_are_in_no_key():
+    name = "airl.challenger.mixed_share"
+    none, half = (with_field(in_use(), name, share) for share in (0.0, 0.5))
+    assert key(airl(none)) == key(airl(in_use())) != key(airl(half))
 
 
 def test_training_to_the_end_is_in_no_key():

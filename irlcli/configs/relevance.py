@@ -141,7 +141,8 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         # Before what follows from the number of worlds: a minibatch is at most a rollout.
         ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
         ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
-        airl = replace(airl, challenger=replace(airl.challenger, ppo=ppo))
+        share = airl.challenger.mixed_share or UNSET
+        airl = replace(airl, challenger=replace(airl.challenger, ppo=ppo, mixed_share=share))
     if airl.replay_share == 0.0:
         airl = replace(
             airl,

@@ -178,6 +178,8 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         ceiling: quantile of g on the demonstrations that bounds a challenger's reward.
         replay_episodes_per_round, replay_capacity: episodes a setting that each round adds, and
             that are kept, every round's with the same probability.
+        mixed_share: of the challengers' samples, those whose numbers are mixed with an expert's;
+            see :mod:`irlcli.learners.mixing`.
         ppo: as that of the retrained policies where a settings file is silent; in the student's
             worlds.
     """
@@ -187,6 +189,7 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     ceiling: Quantile = 0.9
     replay_episodes_per_round: Count = 2
     replay_capacity: Count = 200
+    mixed_share: Fraction | UnsetType = UNSET
     ppo: PPOConfig = PPOConfig()
 
 

@@ -41,6 +41,7 @@ from irlcli.learners.discriminator import (
     penalty_weight_at,
 )
 from irlcli.learners.grouping import Group, Part, apportion, group
+from irlcli.learners.mixing import mixed
 from irlcli.learners.pay import (
     bounded_pay,
     level_of,
@@ -245,6 +246,9 @@ class AIRL:
             torch.manual_seed(derive("dropout", self._seed, index)[0])
             for _ in range(config.updates_per_round):
                 batches = [sample_minibatch(s, generator, config.replay_share) for s in sources]
+                if config.challenger.mixed_share:
+                    share = config.challenger.mixed_share
+                    batches[1:] = [mixed(batch, share, generator) for batch in batches[1:]]
                 loss = self._loss(batches, weight, generator)
                 self._optimizer.zero_grad()
                 loss.total.backward()

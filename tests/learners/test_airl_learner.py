@@ -176,8 +176,8 @@ CHALLENGED = [
         "gradient_penalty": 1.0,
         "learning_rate_schedule": "linear",
     }
-    | {"challenger": ChallengerConfig(life=life, ppo=LONG)}
-    for life in (1, 2)
+    | {"challenger": ChallengerConfig(life=life, mixed_share=mixed, ppo=LONG)}
+    for life, mixed in ((1, 0.0), (2, 0.5))
 ]
 
 
