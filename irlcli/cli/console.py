@@ -226,6 +226,7 @@ def print_table(
     block of lines: no number, id or name is ever cut.
     """
     stream = sys.stderr if stderr else sys.stdout
+    title, *columns = (printable(text) for text in (title, *columns))
     rows = [[printable(str(cell)) for cell in row] for row in rows]
     if not stream.isatty():
         widths = [max(len(r[i]) for r in [columns, *rows]) for i in range(len(columns))]
@@ -244,9 +245,9 @@ def print_table(
     if fitting is None:
         _write("\n".join([*([title] if title else []), *_blocks(columns, rows)]), stream)
         return
-    table = Table(title=title or None, title_justify="left")
+    table = Table(title=Text(title) if title else None, title_justify="left")
     for column, width in zip(columns, fitting, strict=True):
-        table.add_column(Text(column), width=width)
+        table.add_column(Text(column), width=width, overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     terminal.print(table)
@@ -254,14 +255,16 @@ def print_table(
 
 def _widths(columns: Sequence[str], rows: Sequence[Sequence[str]], total: int) -> list[int] | None:
     """The width of each column in a table as wide as ``total``; None if a word would be cut."""
+    from rich.cells import cell_len
+
     cells = list(zip(columns, *rows, strict=True))
-    widths = [max(len(word) for cell in of for word in cell.split() or [""]) for of in cells]
+    widths = [max(cell_len(word) for cell in of for word in cell.split() or [""]) for of in cells]
     # A border before each cell and after the last, and a space on either side of each.
     spare = total - 3 * len(columns) - 1 - sum(widths)
     if spare < 0:
         return None
     for index, of in enumerate(cells):
-        wider = min(spare, max(map(len, of)) - widths[index])
+        wider = min(spare, max(map(cell_len, of)) - widths[index])
         widths[index] += wider
         spare -= wider
     return widths
@@ -272,6 +275,8 @@ def _blocks(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
     The heads are the first cell and those of columns without a name.
     """
+    if not rows:
+        return ["  ".join(columns)]
     margin = max(map(len, columns))
     lines = []
     for row in rows:

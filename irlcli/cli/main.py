@@ -84,7 +84,8 @@ def _usage(error: Any) -> UsageError:
     hint = f"`{path} --help` lists the options"
     if extra:
         message = f"Unexpected argument: {extra[1]}"
-        hint = f"write a list with commas and without spaces, as in --seeds 0,1; {hint}"
+        if {"--rows", "--seeds", "--methods"} & set(sys.argv):
+            hint = f"write a list with commas and without spaces, as in --seeds 0,1; {hint}"
     return UsageError(message[0].lower() + message[1:], hint)
 
 

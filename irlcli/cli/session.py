@@ -18,15 +18,16 @@ if TYPE_CHECKING:
     from irlcli.stages.base import Request
 
 
-# The sections of a config that a stage's parameters may come from. Challengers learn as retrained
-# policies do, clones have the student's network, and a bank is looked for under the whole config.
+# The sections of a config that a stage and its command read. Challengers learn as retrained policies
+# do, clones have the student's network, and a collected expert is compared with the bar. What other
+# stages read is not checked: a bank, say, is looked for under the whole config.
 _SECTIONS = {
     "train-expert": {"expert"},
-    "collect-experts": {"demonstrations", "gridworld"},
+    "collect-experts": {"demonstrations", "expert", "gridworld"},
     "train-airl": {"airl", "transfer"},
     "choose-penalty": {"airl", "transfer", "evaluation"},
-    "clone": {"airl", "transfer", "clone"},
-    "train-maxent": {"maxent", "gridworld"},
+    "clone": {"airl", "clone"},
+    "train-maxent": {"maxent"},
     "transfer": {"transfer"},
     "evaluate": {"evaluation"},
     "import": set[str](),
@@ -87,6 +88,7 @@ class StageSession(base.StageSession):
         self.as_json = as_json
         self.dry_run = dry_run
         self.tensorboard = tensorboard
+        self._prepared: list[Request] = []
 
     def place_words(self) -> list[str]:
         """The options that give another command line the same stores and the same way to work."""
@@ -123,7 +125,7 @@ class StageSession(base.StageSession):
         Returns:
             the artefacts; none with ``--dry-run``.
         """
-        self._warn_of_unread(requests)
+        self._warn_of_unread([*self._prepared, *requests])
         if self.dry_run:
             if name is not None:
                 self.store.check_name(name)
@@ -136,7 +138,7 @@ class StageSession(base.StageSession):
         return artefacts
 
     def _warn_of_unread(self, requests: Sequence["Request"]) -> None:
-        """Warn of a ``--set`` that none of the stages behind ``requests`` reads."""
+        """Warn of a ``--set`` of a section that none of the stages behind ``requests`` reads."""
         stages = {stage for request in requests for stage in _stages(request)}
         if not stages <= _SECTIONS.keys():
             return
@@ -152,6 +154,7 @@ class StageSession(base.StageSession):
 
         With ``--dry-run`` None if it is missing; the printed plan then shows ``then`` as blocked.
         """
+        self._prepared.append(request)
         if not self.dry_run:
             return super().prepare(request, then)
         from irlcli.experiments.runner import Step

@@ -1,9 +1,9 @@
 """Negatives that mix a challenger's numbers with an expert's.
 
 What experts do comes together: a walking ant has certain poses and a certain velocity. From experts
-and policies alone a reward may learn to pay for the poses, and a new policy takes the poses without
+and policies alone a reward may learn to value the poses, and a new policy takes the poses without
 the velocity. In a mixed sample each number is the expert's or the challenger's. To tell it from an
-expert's, a reward has to pay for all of them.
+expert's, a reward has to depend on all of them.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ def mixed(batch: Minibatch, share: float, generator: torch.Generator) -> Minibat
     """``batch`` with about ``share`` of its policy samples mixed with the expert samples beside them.
 
     Each mixed sample draws a probability, uniform on [0, 1]. With it, each number of the
-    observation is the expert's, and so is the action as a whole. The successor takes the same
-    numbers from the expert's successor. Experts' samples and log pi stay as they are.
+    observation is the expert's, and so are the action as a whole and whether the episode ended.
+    The successor takes the same numbers from the expert's successor. Absorbing rows are mixed, too.
+    Experts' samples and log pi stay as they are.
 
     Args:
         batch: samples [E, 2, B].
@@ -43,4 +44,5 @@ def mixed(batch: Minibatch, share: float, generator: torch.Generator) -> Minibat
         observations=taking(batch.observations, columns),
         next_observations=taking(batch.next_observations, columns),
         actions=taking(batch.actions, action),
+        terminated=taking(batch.terminated.unsqueeze(-1), action).squeeze(-1),
     )

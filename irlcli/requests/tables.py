@@ -91,7 +91,8 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     if not is_name(f"{tag}.{table.name}"):
         raise UsageError(
             f"--tag {tag!r} cannot begin a name",
-            "use a letter, then letters, digits, '.', '_' or '-'",
+            "use a letter, then letters, digits, '.', '_' or '-', 100 characters at most with the "
+            "name of the step",
         )
     session.table_file = table.settings
     selection = Selection(tag, candidates, until, choice.only)

@@ -167,6 +167,18 @@ def test_a_field_that_no_stage_of_the_command_reads_is_named(irl, smoke_store, l
     assert (f"warning: --set {item} changes nothing" in done.err) == unread
 
 
+def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):
+    line = ["train-airl", "--demos", "demos", "--method", "irm", "--choose-penalty", "0.1,1"]
+    item = "evaluation.episodes=2"
+    done = irl(*line, "--set", item, *SMOKE, "--store", store_copy.path)
+    assert done.code == 0 and "changes nothing" not in done.err
+
+
+def test_stray_arguments_are_no_lists_where_no_list_is_given(irl):
+    done = irl("ls", "surplus")
+    assert done.code == 2 and "commas" not in done.err
+
+
 def test_a_list_with_spaces_is_explained(irl, empty_store):
     done = irl("plan", "table1", "--rows", "ant", "lunar-lander", "--store", empty_store.root)
     assert done.code == 2 and "lunar-lander" in done.err

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from irlcli.cli.console import print_table
 
-WORD = st.text("abcxyz0123456789.-_%±", min_size=1, max_size=14)
+WORD = st.text("abcxyz0123456789.-_%±日", min_size=1, max_size=14)
 CELL = st.lists(WORD, max_size=4).map(" ".join)
 
 
@@ -18,13 +18,13 @@ class Terminal(io.StringIO):
         return True
 
 
-def printed(columns, rows, width: int) -> str:
+def printed(columns, rows, width: int, title: str = "A title") -> str:
     with pytest.MonkeyPatch.context() as patch:
         terminal = Terminal()
         patch.setattr("sys.stdout", terminal)
         patch.setenv("COLUMNS", str(width))
         patch.setenv("TERM", "xterm")
-        print_table(columns, rows, "A title")
+        print_table(columns, rows, title)
     return re.sub(r"\x1b\[\d*m", "", terminal.getvalue())
 
 
@@ -49,3 +49,8 @@ def test_a_table_that_does_not_fit_becomes_blocks_that_name_their_columns():
         ["AIRL-ERM", "291.7"],
         ["training", "experts,", "reused", "282.5"],
     ]
+
+
+def test_headings_are_shown_without_rows_and_a_title_is_no_markup():
+    assert printed(["setting", "AIRL-ERM"], [], 8).split() == ["A", "title", "setting", "AIRL-ERM"]
+    assert "[bold]" in printed(["a column"], [["b"]], 80, title="[bold]T[/]")

@@ -19,7 +19,7 @@ def a_batch(size: int, width: int) -> Minibatch:
         observations=label.expand(2, 2, size, width),
         actions=label.expand(2, 2, size, 3),
         next_observations=label.expand(2, 2, size, width) + 10.0,
-        terminated=torch.zeros(2, 2, size),
+        terminated=torch.arange(2.0).reshape(1, 2, 1).expand(2, 2, size),
         log_probs=torch.randn(2, 2, size),
     )
 
@@ -43,6 +43,7 @@ def test_each_number_is_the_policys_or_the_experts(share):
     torch.testing.assert_close(found.next_observations[:, 0], policy + 10.0)
     # The action is one or the other as a whole.
     assert torch.equal(found.actions[:, 0].amin(-1), found.actions[:, 0].amax(-1))
+    assert torch.equal(found.actions[:, 0, :, 0], found.terminated[:, 0])
     for name in ("observations", "actions", "next_observations"):
         assert torch.equal(getattr(found, name)[:, 1], getattr(batch, name)[:, 1])
     # With a uniform probability of each number, their count is uniform on 0 to 6.

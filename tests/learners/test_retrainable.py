@@ -150,6 +150,30 @@ def test_each_challenger_starts_from_other_random_weights(demos):
     assert not torch.equal(*weights)
 
 
+def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
+    """Before the update a challenger's sample tells itself by its numbers: all are of one policy."""
+    config = replace(CHALLENGED["challenger"], mixed_share=1.0)
+    trainer, learner, challengers = challenged(demos, challenger=config, fixed_horizon=False)
+    seen = []
+    logits = airl.discriminator_logits
+
+    def record(model, batch, form):
+        seen.append(batch.observations[:, 0].detach().clone())
+        return logits(model, batch, form)
+
+    monkeypatch.setattr(airl, "discriminator_logits", record)
+    rollouts, challenge = trainer.train_round(0, learner), challengers.train_round(0)
+    learner.update(0, rollouts, trainer.policy, challenge)
+    acted = {tuple(row) for r in rollouts for row in r.observations.reshape(-1, 8).tolist()}
+    challenged_ = {tuple(row) for r in challenge for row in r.observations.reshape(-1, 8).tolist()}
+    students, theirs = (
+        [{tuple(row) for row in batch.reshape(-1, 8).tolist()} for batch in seen[part:-1:2]]
+        for part in (0, 1)
+    )
+    assert all(found <= acted for found in students)
+    assert not any(found <= challenged_ for found in theirs)
+
+
 def test_a_challenger_is_paid_the_bounded_reward(demos):
     trainer, learner, _ = challenged(demos, fixed_horizon=False)
     (rollout,) = trainer.train_round(0, learner)
