@@ -139,6 +139,8 @@ class StageSession(base.StageSession):
 
     def _warn_of_unread(self, requests: Sequence["Request"]) -> None:
         """Warn of a ``--set`` of a section that none of the stages behind ``requests`` reads."""
+        if not self.overrides:
+            return
         stages = {stage for request in requests for stage in _stages(request)}
         if not stages <= _SECTIONS.keys():
             return

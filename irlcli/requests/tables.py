@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
-from irlcli.store.layout import is_name
 
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
@@ -88,12 +87,10 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
             )
         candidates = arguments.weights(choice.choose_penalty)
     tag = choice.tag or (table.name if table.settings else session.profile)
-    if not is_name(f"{tag}.{table.name}"):
-        raise UsageError(
-            f"--tag {tag!r} cannot begin a name",
-            "use a letter, then letters, digits, '.', '_' or '-', 100 characters at most with the "
-            "name of the step",
-        )
+    try:
+        session.store.check_name(f"{tag}.{table.name}")
+    except UsageError as error:
+        raise UsageError(f"--tag {tag!r} cannot begin a name", error.hint) from None
     session.table_file = table.settings
     selection = Selection(tag, candidates, until, choice.only)
     plan = Plan(table, selection, session.config, session.runner().lookup())

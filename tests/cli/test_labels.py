@@ -5,7 +5,8 @@ import shutil
 
 import pytest
 
-from irlcli.cli import console
+from irlcli import labels
+from irlcli.cli import console, jobs
 from irlcli.errors import UsageError
 from irlcli.experiments import provenance
 from irlcli.store import Store
@@ -13,6 +14,21 @@ from irlcli.store import Store
 SMOKE = ["--profile", "smoke"]
 TRAIN = ["train-airl", "--demos", "demos", "--method", "irm", "--name", "airl"]
 TRANSFER = ["transfer", "--reward", "airl/reward.pt", "--ood", "1.5x", "--name", "moved"]
+
+
+def test_labels_tell_mixed_challengers_from_others():
+    found = [
+        labels.learned({"grouping": "pooled", "penalty": "none", "challenger": challenger})
+        for challenger in ({"life": 0}, {"life": 9}, {"life": 9, "mixed_share": 0.5})
+    ]
+    assert "challengers" not in found[0]
+    assert found[1].endswith("with challengers") and found[2].endswith("with mixed challengers")
+
+
+def test_a_run_says_which_steps_resume(capsys):
+    shown = jobs.PlainJobs(console.TerminalConsole())
+    shown.line("standard.step", "RESUME train-airl erm seed 0")
+    assert "RESUME standard.step" in capsys.readouterr().err
 
 
 def test_ls_shows_the_method_behind_transfers_and_evaluations(irl, store_copy):
