@@ -68,3 +68,9 @@ def tables(incomplete: str) -> list[tuple[str, str]]:
     from irlcli.experiments.tables import load_tables
 
     return [(table.name, table.title) for table in load_tables().values()]
+
+
+def reports(incomplete: str) -> list[tuple[str, str]]:
+    """What ``irl report`` writes, with titles."""
+    own = [("returns", "True returns of evaluations"), ("table2", "Table 2: the values of the interventions")]
+    return own + tables(incomplete)

@@ -86,6 +86,12 @@ def _usage(error: Any) -> UsageError:
         message = f"Unexpected argument: {extra[1]}"
         if {"--rows", "--seeds", "--methods"} & set(sys.argv):
             hint = f"write a list with commas and without spaces, as in --seeds 0,1; {hint}"
+    missing = re.match("^Missing argument '(TABLE|REPORT)'", message)
+    if missing:
+        from irlcli.cli import complete
+
+        known = complete.tables("") if missing[1] == "TABLE" else complete.reports("")
+        hint = f"known: {', '.join(name for name, _ in known)}"
     return UsageError(message[0].lower() + message[1:], hint)
 
 

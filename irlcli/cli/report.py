@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from irlcli.cli import complete
 from irlcli.cli import console as out
 from irlcli.cli import returns
 from irlcli.cli.experiments import (
@@ -32,12 +33,6 @@ from irlcli.store import Artefact
 _FORMS = ("text", "markdown", "latex")
 
 
-def _kinds(incomplete: str) -> list[str]:
-    from irlcli.cli.complete import tables
-
-    return ["returns", "table2", *(name for name, _ in tables(incomplete))]
-
-
 def _forms(incomplete: str) -> list[str]:
     return list(_FORMS)
 
@@ -46,7 +41,12 @@ def _forms(incomplete: str) -> list[str]:
 def report(
     session: StageSession,
     kind: Annotated[
-        str, typer.Argument(help="returns, table2, or a table: table1, ...", autocompletion=_kinds)
+        str,
+        typer.Argument(
+            metavar="REPORT",
+            help="returns, table2, or a table: table1, ...",
+            autocompletion=complete.reports,
+        ),
     ],
     refs: Annotated[list[str] | None, typer.Argument(help="Evaluations, for returns.")] = None,
     seeds: Seeds = None,

@@ -188,3 +188,10 @@ def test_a_list_with_spaces_is_explained(irl, empty_store):
 def test_a_tag_that_cannot_begin_a_name_is_named(irl, empty_store):
     done = irl("plan", "demo", "--tag", "a b", "--store", empty_store.root)
     assert done.code == 2 and "--tag 'a b'" in done.err
+
+
+@pytest.mark.parametrize("command", ["plan", "run", "report"])
+def test_a_missing_table_lists_the_tables(irl, command):
+    done = irl(command)
+    assert done.code == 2
+    assert {"table1", "figure2", "gates"} <= set(re.findall(r"\w+", done.err.splitlines()[-1]))
