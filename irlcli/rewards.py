@@ -126,7 +126,7 @@ def load_reward(
             first one it was learned in. Only the goal of a setting changes an observation's size.
         gamma: discount of the policy that is trained on it, for the value of an absorbing state
             (a reward learned with ``airl.fixed_horizon``): from 0 to less than 1. By default
-            ``airl.gamma`` of its config.
+            ``airl.ppo.gamma`` of its config.
         ceiling: bound of g as a quantile of g on the demonstrations, as ``transfer.ceiling``; None:
             unbounded.
 
@@ -141,7 +141,7 @@ def load_reward(
 
     if gamma is not None and not 0.0 <= gamma < 1.0:
         raise UsageError(f"gamma = {gamma:g} is no discount", "give a number from 0 to less than 1")
-    if ceiling is not None and not 0.0 < ceiling <= 1.0:
+    if ceiling is not None and not 0.0 <= ceiling <= 1.0:
         raise UsageError(f"ceiling = {ceiling:g} is no quantile", "give a number from 0 to 1")
     if env is not None:
         resolve(env)

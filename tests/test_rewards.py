@@ -74,13 +74,13 @@ def steps(env, count, seed=0):
 
 @pytest.mark.parametrize("env", SPACES)
 @pytest.mark.parametrize("absorbing", [False, True])
-@pytest.mark.parametrize("ceiling", [None, 0.75])
+@pytest.mark.parametrize("ceiling", [None, 0.75, 0.0])
 def test_it_is_g_by_scale_with_ceiling_and_absorbing_states(tmp_path, env, absorbing, ceiling):
     view = "sampled" if env == "lunar-lander" else "executed"
     path, model = write_random_reward(tmp_path, env, fixed_horizon=absorbing, actions=view)
     reward = irlcli.load_reward(path, gamma=0.75, ceiling=ceiling)
     obs, act, following, done = steps(env, 50)
-    bound = math.inf if ceiling is None else 0.25  # of the quantiles from -0.5 to 0.5
+    bound = math.inf if ceiling is None else ceiling - 0.5  # of the quantiles from -0.5 to 0.5
     if SPACES[env][2]:
         vectors = np.eye(4, dtype=np.float32)[act]
     else:

@@ -110,10 +110,7 @@ class TerminalConsole:
 
     def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
         """A stage ended, or its artefact existed (``hit``)."""
-        self._close_live()
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        self.close()
         self.say(f"{'HIT' if hit else 'DONE'} {label}: {artefact.directory}")
 
     def found(self, label: str, artefact: Artefact, where: Path | str) -> None:
@@ -122,8 +119,11 @@ class TerminalConsole:
         self.say(f"FOUND {label}: {artefact.directory}, copied from {where}")
 
     def close(self) -> None:
-        """Restore the terminal."""
+        """Restore the terminal, and write what TensorBoard still has to get."""
         self._close_live()
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
     def _draw(self, done: int, total: int, detail: str) -> None:
         from rich.console import Console

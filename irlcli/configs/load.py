@@ -270,22 +270,28 @@ def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
         if name not in fields:
             where = ".".join((*path, str(name)))
             raise UsageError(f"unknown field {where!r}", suggest(str(name), fields))
-        for inner in (fields[name], *get_args(fields[name])):
-            if inner == _INTERVENTIONS or (isinstance(inner, type) and issubclass(inner, Struct)):
-                _check_names(value, inner, (*path, name))
-                break
+        if inner := _table(fields[name]):
+            _check_names(value, inner, (*path, name))
 
 
 def _with_none(tree: Mapping[str, Any], kind: Any) -> dict[str, Any]:
     """``tree`` with None for "none" where a field of ``kind`` may be None: TOML has no null."""
     found = dict(tree)
     for name, value in tree.items():
-        inner = kind.__annotations__.get(name)
-        if value == "none" and type(None) in get_args(inner):
+        field = InterventionConfig if kind == _INTERVENTIONS else kind.__annotations__.get(name)
+        if value == "none" and type(None) in get_args(field):
             found[name] = None
-        elif isinstance(value, Mapping) and isinstance(inner, type) and issubclass(inner, Struct):
+        elif isinstance(value, Mapping) and (inner := _table(field)):
             found[name] = _with_none(value, inner)
     return found
+
+
+def _table(field: Any) -> Any:
+    """The kind of a TOML table that a field of this annotation is; None for another field."""
+    for kind in (field, *get_args(field)):
+        if kind == _INTERVENTIONS or (isinstance(kind, type) and issubclass(kind, Struct)):
+            return kind
+    return None
 
 
 def _override(item: str) -> dict[str, Any]:

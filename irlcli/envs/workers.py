@@ -26,7 +26,7 @@ import gymnasium
 import numpy as np
 
 from irlcli.envs.vector import Ended, VectorWorlds
-from irlcli.errors import StageFailed
+from irlcli.errors import IrlError, StageFailed
 
 _CLOSE_SECONDS = 5.0
 # Raised by a pipe whose other end is closed.
@@ -37,8 +37,15 @@ _PLAIN, _PICKLED = b"0", b"1"
 class WorkerFailed(StageFailed):
     """A worker process died, or an environment in it raised an error (exit 1)."""
 
-    def __init__(self, message: str):
-        super().__init__(message, "run the same command again to resume")
+    def __init__(self, message: str, hint: str = ""):
+        super().__init__(message, hint or "run the same command again to resume")
+
+
+class _Failure(NamedTuple):
+    """An error in a worker, and its hint."""
+
+    message: str
+    hint: str
 
 
 class _Channel(NamedTuple):
@@ -114,8 +121,10 @@ def _work(
             channel.send(ended or None)
     except _CLOSED:
         pass
+    except IrlError as error:
+        channel.send(_Failure(error.message, error.hint))
     except Exception as error:
-        channel.send(f"{type(error).__name__}: {error}")
+        channel.send(_Failure(f"{type(error).__name__}: {error}", ""))
     finally:
         if worlds is not None:
             worlds.close()
@@ -239,8 +248,8 @@ class WorkerWorlds:
                 self._channels[worker].send(request)
             for worker, channel in enumerate(self._channels):
                 answer = channel.receive()
-                if isinstance(answer, str):
-                    raise WorkerFailed(f"{self._name(worker)}: {answer}")
+                if isinstance(answer, _Failure):
+                    raise WorkerFailed(f"{self._name(worker)}: {answer.message}", answer.hint)
                 ended += answer or []
         except BaseException as error:
             # An unread answer would be mistaken for the answer to the next request.

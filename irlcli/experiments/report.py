@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from irlcli.configs import ExpertConfig
 from irlcli.errors import NotFound
 from irlcli.experiments import facts
 from irlcli.experiments.plan import Plan
@@ -77,11 +78,17 @@ def _experts(
             f"{plan.lookup.store.root} holds no evaluation of an expert with this config",
             f"`irl run {plan.table.name}` makes them. --profile and --set must be those of the runs",
         )
-    configs = {row.env: plan.configs(row.env).expert for row in plan.table.rows}
+    experts: dict[str, ExpertConfig] = {}
+    for row in plan.table.rows:
+        config = plan.configs(row.env)
+        experts[row.env] = config.expert
+        listed = config.interventions.get(row.knob)
+        if listed is not None and listed.expert is not None:
+            experts[f"{row.env} {row.knob}"] = listed.expert
     parameters = report_experts.Parameters(
         command=command,
-        steps={env: expert.total_steps for env, expert in configs.items()},
-        bars={env: expert.bar for env, expert in configs.items() if expert.bar is not None},
+        steps={name: expert.total_steps for name, expert in experts.items()},
+        bars={name: expert.bar for name, expert in experts.items() if expert.bar is not None},
         cells=tuple(cells),
         runs=dict(runs),
     )

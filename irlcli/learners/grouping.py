@@ -58,7 +58,6 @@ def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> lis
             shares[g].sum() / len(counts),
         )
         for g in settings
-        if shares[g].sum() > 0.0
     ]
 
 

@@ -26,10 +26,11 @@ def discriminator(samples: Samples, options: PenaltyOptions) -> torch.Tensor:
     """sum_e (q_e - w_e) R_e / lambda, a scalar: the loss's sum w R plus lambda times this is sum q R.
 
     The shares q are held fixed. Where settings have unequal weights w, q is proportional to
-    w exp(lambda R). Zero at lambda = 0.
+    w exp(lambda R). Zero at lambda = 0, and where no setting has a weight (``airl.challenger.share``
+    = 1).
     """
     risks, weights = samples.risks, samples.weights
-    if options.weight == 0.0:
+    if options.weight == 0.0 or not weights.any():
         return risks.new_zeros(())
     shares = weights.sum() * (weights.log() + options.weight * risks.detach()).softmax(0)
     return ((shares - weights) * risks).sum() / options.weight

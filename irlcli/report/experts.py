@@ -40,7 +40,7 @@ def summarise(
     Args:
         cells: the wanted evaluations; rows are ``ENV KNOB``.
         runs: provenance by id; an evaluation's only input is its policy.
-        steps: an expert's budget, by environment.
+        steps: an expert's budget, by environment, and by row where it has its own.
         summaries: the existing evaluations by (agent, environment, setting), each a
             :class:`irlcli.data.descriptions.Returns`.
     """
@@ -67,7 +67,7 @@ def summarise(
                 "episodes": _value(expert, "episodes"),
                 "idle_return": _value(idle, "mean_return"),
                 "random_return": _value(random, "mean_return"),
-                "steps": steps[env],
+                "steps": steps.get(cell.row, steps[env]),
                 "seconds": trained[0].seconds if trained else None,
                 "resumed": trained[0].resumed if trained else None,
                 "commit": ", ".join(commits(trained)) if trained else None,
@@ -101,13 +101,14 @@ def text_table(found: pd.DataFrame) -> Table:
 
 
 def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
-    """Experts that do not reach their environment's bar, and missing ones."""
+    """Experts that do not reach their bar, and missing ones. ``bars``: by environment and by row, as the steps."""
     experts = [cell for cell in cells if cell.agent == "expert"]
     missing = [f"{cell.row.split()[0]} {cell.place}" for cell in experts if not cell.run]
     low = [
-        f"{row.env} {row.setting} ({row.true_return:.0f} of {bars[row.env]:.0f})"
+        f"{row.env} {row.setting} ({row.true_return:.0f} of {bar:.0f})"
         for row in found.itertuples()
-        if row.env in bars and row.true_return < bars[row.env]
+        if (bar := bars.get(f"{row.env} {row.knob}", bars.get(row.env))) is not None
+        and row.true_return < bar
     ]
     sentences = [f"Below their bar, so not yet experts: {', '.join(low)}."] if low else []
     if missing:

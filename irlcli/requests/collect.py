@@ -6,7 +6,7 @@ from irlcli.data.descriptions import Collected
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
 from irlcli.experiments.references import output, recorded
-from irlcli.interventions import Setting
+from irlcli.interventions import Setting, parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import collect_experts as collect_stage
@@ -52,8 +52,10 @@ def collect_experts(
 def missed_bars(session: StageSession, artefact: Artefact) -> Iterator[str]:
     """A warning for each expert whose mean true return is below the config's bar."""
     summary = output(session.store, artefact, "summary.json", Collected)
-    bar = session.config(summary.env).expert.bar
+    config = session.config(summary.env)
     for row in summary.settings:
+        setting = without_cue(summary.env, parse_setting(summary.env, row.setting))
+        bar = config.expert_of(setting).bar
         if bar is not None and row.mean_return < bar:
             yield (
                 f"the expert of {summary.env} {row.setting} is below its bar: mean true return "

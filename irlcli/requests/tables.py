@@ -13,7 +13,9 @@ from irlcli.requests.session import StageSession
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.status import Step
+    from irlcli.experiments.tables import Table
 
+_WEIGHT = "airl.penalty_weight"
 # In a name, which may have 100 characters in all.
 _LONGEST_ROWS = 50
 
@@ -62,7 +64,8 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     """The plan of the chosen part of a table. The table's settings file becomes the session's.
 
     Raises:
-        UsageError: an unknown table, row, method, phase or step, or another bad option.
+        UsageError: an unknown table, row, method, phase or step, a lambda that the table lists
+            itself, or another bad option.
     """
     from irlcli.experiments.plan import Plan, Selection
     from irlcli.experiments.rows import PHASES
@@ -75,6 +78,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
         choice.row_names(),
     )
+    _check_weights(session, table)
     until = PHASES[-1] if choice.until is None else choice.until
     if until not in PHASES:
         raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
@@ -97,6 +101,18 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
+
+
+def _check_weights(session: StageSession, table: "Table") -> None:
+    """Refuse a lambda for all methods where the table lists one for some of them."""
+    listed = [method for method in table.methods if method in table.penalty_weights]
+    changed = [o for o in session.overrides if o.partition("=")[0].strip() == _WEIGHT]
+    if listed and changed:
+        raise UsageError(
+            f"--set {changed[-1]} does not apply to {', '.join(listed)}: {table.name} lists their "
+            "lambda",
+            "omit them from --methods, or change the table with --experiments",
+        )
 
 
 def _words(text: str) -> list[str]:

@@ -195,3 +195,10 @@ def test_a_missing_table_lists_the_tables(irl, command):
     done = irl(command)
     assert done.code == 2
     assert {"table1", "figure2", "gates"} <= set(re.findall(r"\w+", done.err.splitlines()[-1]))
+
+
+def test_a_lambda_for_all_methods_is_refused_where_the_table_lists_some(irl, tmp_path):
+    line = ["plan", "control-airl", "--set", "airl.penalty_weight=30", "--store", tmp_path / "s"]
+    done = irl(*line, "--methods", "irm,l2")
+    assert done.code == 2 and "l2" in done.err and "irm" not in done.err.splitlines()[0]
+    assert irl(*line, "--methods", "irm").code == 0

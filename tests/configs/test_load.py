@@ -433,11 +433,9 @@ def test_challengers_learn_as_retrained_policies_do():
 
 
 def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
-    legs, friction = (
-        parse_settings("ant", text)[0] for text in ("leg-length=2x", "friction=2:0.6:0.6")
-    )
+    legs, mass = (parse_settings("ant", text)[0] for text in ("leg-length=2x", "mass=2x"))
     config = load_config("ant")
-    for setting in (legs, friction):
+    for setting in (legs, mass):
         challenger = config.airl_of(setting).challenger
         assert challenger.ppo == config.transfer_of(setting).ppo
         others = msgspec.structs.replace(config.airl, challenger=challenger)
@@ -493,4 +491,8 @@ def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():
 def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):
     assert load_config(LANDER).transfer.ceiling == 0.9
     assert load_config(LANDER, file=toml('[transfer]\nceiling = "none"')).transfer.ceiling is None
+    lifted = toml('[interventions.bounce]\nid = ["0.1"]\n[interventions.bounce.transfer]\nceiling = "none"')
+    (bounce,) = parse_settings(LANDER, "bounce=0.1")
+    assert load_config(LANDER).transfer_of(bounce).ceiling == 0.9
+    assert load_config(LANDER, file=lifted).transfer_of(bounce).ceiling is None
     assert "airl.hidden" in refused(file=toml('[airl]\nhidden = "none"')).message

@@ -17,6 +17,7 @@ from mujoco_robots import HalfCheetah
 
 from irlcli.envs.vector import VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
+from irlcli.errors import StageFailed
 
 SEEDS = [3, 1, 4]
 FACTORIES = [
@@ -123,6 +124,22 @@ def test_an_environments_error_names_the_worker_and_its_worlds():
     assert wait_for_death(pids)
     with pytest.raises(WorkerFailed, match="closed"):
         worlds.step(np.zeros(3, dtype=np.int64))
+
+
+class Refusing(Fragile):
+    """An environment whose error has a hint of its own."""
+
+    def step(self, action):
+        raise StageFailed("it has no floor", "give it a floor")
+
+
+def test_the_hint_of_an_environments_error_is_kept():
+    worlds = WorkerWorlds([Refusing, Refusing], max_episode_steps=100, workers=2)
+    worlds.reset([0, 0])
+    with pytest.raises(WorkerFailed) as failed:
+        worlds.step(np.zeros(2, dtype=np.int64))
+    assert failed.value.message == "worker 0 (world 0): it has no floor"
+    assert failed.value.hint == "give it a floor"
 
 
 def test_a_dead_worker_is_reported_and_the_others_are_ended():

@@ -1,6 +1,6 @@
 """The experts' table, caveats, page and learning curves."""
 
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -29,12 +29,12 @@ def returns(mean):
     )
 
 
-def summarised(cells=CELLS):
+def summarised(cells=CELLS, steps=MappingProxyType({"lunar-lander": 1000})):
     evaluated = {
         ("expert", "lunar-lander", "bounce=0.1"): returns(250.0),
         ("random", "lunar-lander", "bounce=0.1"): returns(-200.0),
     }
-    return experts.summarise(cells, RUNS, {"lunar-lander": 1000}, evaluated)
+    return experts.summarise(cells, RUNS, steps, evaluated)
 
 
 def test_a_setting_has_its_experts_return_and_training():
@@ -54,6 +54,13 @@ def test_caveats_name_missing_experts_and_those_below_their_bar(bar, low):
     assert found[-1] == "Missing: 1 of 2 experts: lunar-lander bounce=0.9."
     assert len(found) == 1 + low
     assert not low or "bounce=0.1 (250 of 260)" in found[0]
+
+
+def test_a_row_may_have_its_own_bar_and_budget():
+    found = summarised(steps={"lunar-lander": 1000, ROW: 3000})
+    assert list(found["steps"]) == [3000, 3000]
+    low = experts.caveats(CELLS, found, {"lunar-lander": 200.0, ROW: 260.0})[0]
+    assert "bounce=0.1 (250 of 260)" in low
 
 
 def test_an_intervention_may_hold_no_value_out(tmp_path):

@@ -102,7 +102,8 @@ class Submission:
             new = self._find_queued(missing)
             states = {self._queue.place: self._queue.states()}
             remove(ended(store, states.get, 0.0))
-            needs = {name: [n for n in self._plan.needs[name] if n in missing] for name in new}
+            absent = set(missing)
+            needs = {name: [n for n in self._plan.needs[name] if n in absent] for name in new}
             self._arrays = job_arrays(needs)
             self._waiting = list(self._arrays)
             self._record = new_record(store, self._queue.place)
