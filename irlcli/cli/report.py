@@ -6,9 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from irlcli.cli import complete
+from irlcli.cli import complete, returns
 from irlcli.cli import console as out
-from irlcli.cli import returns
 from irlcli.cli.experiments import (
     ChoosePenalty,
     Methods,

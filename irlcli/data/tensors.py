@@ -92,10 +92,11 @@ def from_bytes(data: bytes) -> Any:
         raise ValueError(_first_line(error)) from None
 
 
-def restore(data: bytes | None, names: set[str], warn: Callable[[str], None]) -> Any:
+def restore(data: bytes | None, names: set[str], discard: Callable[[str], None]) -> Any:
     """The state in a stage's checkpoint, a dict with exactly the keys ``names``.
 
-    Returns None if there is no checkpoint, and warns and returns None if it cannot be used.
+    Returns None if there is no checkpoint. If it cannot be used, calls ``discard`` with the reason
+    and returns None.
     """
     if data is None:
         return None
@@ -105,7 +106,7 @@ def restore(data: bytes | None, names: set[str], warn: Callable[[str], None]) ->
             raise ValueError("another stage wrote it")
         return state
     except ValueError as error:
-        warn(f"the checkpoint cannot be used ({error}): starting over")
+        discard(str(error))
         return None
 
 

@@ -41,12 +41,17 @@ class StageCheckpoints:
                 header, self._state = provenance.decode(stored, stage.name, stage.version)
                 self._earlier = header.attempts
         except ValueError as error:
-            console.warn(f"the checkpoint cannot be used ({error}): starting over")
-            scratch.discard_checkpoint()
+            self.discard(str(error))
 
     def load(self) -> bytes | None:
         """The state to resume from; None at the first attempt."""
         return self._state
+
+    def discard(self, reason: str) -> None:
+        """Start over, with a warning. The attempts so far no longer count: nothing of them is left."""
+        self._console.warn(f"the checkpoint cannot be used ({reason}): starting over")
+        self._scratch.discard_checkpoint()
+        self._state, self._earlier = None, ()
 
     def attempts(self) -> tuple[provenance.Attempt, ...]:
         """All attempts at this artefact so far, the present one last."""

@@ -46,6 +46,9 @@ class Checkpoints(Protocol):
     def load(self) -> bytes | None:
         """The last state saved for this key, or None."""
 
+    def discard(self, reason: str) -> None:
+        """Start over, with a warning: the last state cannot be used for this ``reason``."""
+
     def offer(self, state: Callable[[], bytes]) -> None:
         """Called at the end of every round: saves ``state()`` if a checkpoint is due.
 
@@ -184,7 +187,7 @@ def run_training(job: Job, training: Training | Restarts) -> list[Row]:
     """
     from irlcli.data import tensors
 
-    state = tensors.restore(job.checkpoints.load(), {"training", "rows"}, job.console.warn)
+    state = tensors.restore(job.checkpoints.load(), {"training", "rows"}, job.checkpoints.discard)
     if state is not None:
         # A crafted state can make torch and Python raise anything.
         with tensors.fitting(job.output.parent, Exception):
@@ -219,7 +222,7 @@ def run_parts(
     """
     from irlcli.data import tensors
 
-    state = tensors.restore(job.checkpoints.load(), {"rows"}, job.console.warn)
+    state = tensors.restore(job.checkpoints.load(), {"rows"}, job.checkpoints.discard)
     with tensors.fitting(job.output.parent, Exception):
         done = [] if state is None else json.loads(state["rows"].numpy().tobytes())
 

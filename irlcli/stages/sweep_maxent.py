@@ -136,7 +136,7 @@ def run(job: Job) -> None:
         _, episodes = read_gridworld(path, p.environment.name, p.settings)
         demos[seed] = indexed(settings, episodes, p.gridworld)
     penalties = list(dict.fromkeys(v.penalty for v in p.variants))
-    state = tensors.restore(job.checkpoints.load(), {"rewards", "fit"}, job.console.warn)
+    state = tensors.restore(job.checkpoints.load(), {"rewards", "fit"}, job.checkpoints.discard)
     with tensors.fitting(job.output.parent, Exception):
         rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
     runs: list[tuple[Variant, int]] = []

@@ -112,7 +112,7 @@ def run(job: Job) -> None:
             penalty_warmup=m.penalty_warmup_iterations or 0,
         )
     names = set(learner.state_dict())
-    state = tensors.restore(job.checkpoints.load(), names, job.console.warn)
+    state = tensors.restore(job.checkpoints.load(), names, job.checkpoints.discard)
     if state is not None:
         with tensors.fitting(job.output.parent, Exception):
             learner.load_state_dict(state)

@@ -8,8 +8,8 @@ from pathlib import Path
 from irlcli.store.durable import remove, remove_leftovers, unique_name, write_durably
 
 CHECKPOINT = "checkpoint"
-# Real checkpoints have some tens of MB.
-_MAX_BYTES = 1 << 30
+# Most have some tens of MB, but SAC's replay may have 4 million transitions of 3 KB.
+_MAX_BYTES = 16 << 30
 
 
 class Scratch:

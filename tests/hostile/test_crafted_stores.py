@@ -13,32 +13,46 @@ from irlcli.experiments import provenance
 from irlcli.stages import train_maxent, transfer
 from irlcli.stages.base import Stage
 from irlcli.store import Store
+from irlcli.store.durable import remove
 
 
 def test_checkpoints_of_another_stage_are_not_used():
-    warnings = []
+    reasons = []
     names = {"round", "rows"}
-    assert restore(to_bytes({"round": 1, "rows": "[]"}), names, warnings.append)["round"] == 1
-    assert restore(None, names, warnings.append) is None and not warnings
+    assert restore(to_bytes({"round": 1, "rows": "[]"}), names, reasons.append)["round"] == 1
+    assert restore(None, names, reasons.append) is None and not reasons
     for value in ([], {}, {"round": 1}, {"round": 1, "rows": "", "more": 0}, "text", torch.ones(2)):
-        assert restore(to_bytes(value), names, warnings.append) is None
-    assert len(warnings) == 6 and all("starting over" in text for text in warnings)
+        assert restore(to_bytes(value), names, reasons.append) is None
+    assert len(reasons) == 6 and all(reasons)
 
 
 TRAINING = {"trainer": {}, "learner": {}, "selector": {}, "rounds_done": 0}
 
 
-def save_checkpoint(store: Store, key: str, stage: Stage, state: dict) -> None:
+def save_checkpoint(store: Store, key: str, stage: Stage, state: dict, attempts=()) -> None:
     """Save ``state`` as the checkpoint of ``stage`` for ``key``, with a valid header."""
     header = provenance.Header(
         schema=provenance.SCHEMA,
         stage=stage.name,
         stage_version=stage.version,
         libraries=provenance.libraries(),
-        attempts=(),
+        attempts=attempts,
     )
     with store.working_on(key, wait=False) as scratch:
         scratch.save(header.encode(to_bytes(state)))
+
+
+def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
+    store = Store(store_copy.path)
+    key = store.get(store_copy.transfer).manifest.record.key
+    (store.root / ".keys" / key).unlink()
+    # So that the artefact is written anew, with the provenance of this run.
+    remove(store.root / store_copy.transfer)
+    attempts = (provenance.Clock().attempt(),)
+    save_checkpoint(store, key, transfer.STAGE, {"other": torch.ones(1)}, attempts)
+    done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
+    assert done.code == 0 and "starting over" in done.err
+    assert store.get(store_copy.transfer).provenance()["resumed"] == 0
 
 
 @pytest.mark.parametrize(
