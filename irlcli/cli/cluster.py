@@ -57,17 +57,17 @@ class ClusterOptions(NamedTuple):
             "--time": self.time is not None,
             "--requeues": self.requeues is not None,
         }
-        if self.cluster is None:
-            for option in (name for name, given in (slurm | both).items() if given):
-                raise UsageError(
-                    f"{option} is about jobs of a cluster", "add --cluster slurm, or omit it"
-                )
-        if self.cluster == "local":
-            for option in (name for name, given in slurm.items() if given):
-                raise UsageError(
-                    f"{option} is about Slurm's jobs; --cluster local runs them on this machine",
-                    "omit it; --jobs sets how many run at a time",
-                )
+        of_jobs = [name for name, given in (slurm | both).items() if given]
+        if self.cluster is None and of_jobs:
+            raise UsageError(
+                f"{of_jobs[0]} is about jobs of a cluster", "add --cluster slurm, or omit it"
+            )
+        of_slurm = [name for name, given in slurm.items() if given]
+        if self.cluster == "local" and of_slurm:
+            raise UsageError(
+                f"{of_slurm[0]} is about Slurm's jobs; --cluster local runs them on this machine",
+                "omit it; --jobs sets how many run at a time",
+            )
 
 
 def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":

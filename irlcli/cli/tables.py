@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from irlcli.cli import console as out
 from irlcli.cli.session import StageSession
 from irlcli.errors import StageFailed, UsageError
+from irlcli.report.tables import EVERY_CELL
 from irlcli.requests.tables import Choice
 from irlcli.store import Artefact, read_json
 
@@ -67,7 +68,7 @@ def print_report(session: StageSession, artefact: Artefact, kind: str) -> None:
         out.print_note(session.store.open(artefact, "README.md").read_text().rstrip())
         return
     for table in report["tables"]:
-        if table["title"] != "Every cell":
+        if table["title"] != EVERY_CELL:
             out.print_table(table["columns"], table["rows"], table["title"], stderr=True)
             out.print_note(f"{table['note']}\n" if table["note"] else "")
     for caveat in report["caveats"]:

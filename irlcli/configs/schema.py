@@ -4,7 +4,7 @@ A field is part of every key it can influence; :mod:`irlcli.configs.relevance` s
 cannot.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
@@ -36,7 +36,7 @@ Grouping = Literal["pooled", "balanced", "per-setting", "shuffled"]
 class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """PPO (paper App. C names the values of rl-baselines3-zoo). ``linear`` falls to zero.
 
-    The last six fields are for continuous actions only, except ``normalise_*``.
+    ``log_std_init``, ``log_std_max``, ``use_sde`` and ``sde_sample_freq`` are for continuous actions only.
 
     Attributes:
         n_envs: worlds stepped together.
@@ -281,9 +281,8 @@ class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     Attributes:
         episodes: demonstrations of each value trained on, where they differ.
-        expert, airl, transfer: in a file, what this knob's experts, rewards and retrained policies
-            need different from ``[expert]``, ``[airl]`` and ``[transfer]``; once loaded, their
-            whole config. Challengers follow ``transfer``.
+        expert, airl, transfer: in a file, this knob's overrides of ``[expert]``, ``[airl]`` and
+            ``[transfer]``; once loaded, the whole configs. Challengers follow ``transfer``.
     """
 
     id: tuple[str, ...]
@@ -450,26 +449,18 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     control: ControlConfig = ControlConfig()
 
     def expert_of(self, setting: Setting) -> ExpertConfig:
-        """The config of the expert of ``setting``, with what its only knob needs different."""
-        intervention = self._intervention(setting)
-        if intervention is None or intervention.expert is None:
-            return self.expert
-        return intervention.expert
+        """The config of the expert of ``setting``, with the overrides of its only knob."""
+        return self._of("expert", setting)
 
     def airl_of(self, setting: Setting) -> AIRLConfig:
-        """The config of a reward learned in ``setting``, with what its only knob needs different."""
-        intervention = self._intervention(setting)
-        if intervention is None or intervention.airl is None:
-            return self.airl
-        return intervention.airl
+        """The config of a reward learned in ``setting``, with the overrides of its only knob."""
+        return self._of("airl", setting)
 
     def transfer_of(self, setting: Setting) -> TransferConfig:
-        """The config of a policy retrained in ``setting``, with what its only knob needs different."""
-        intervention = self._intervention(setting)
-        if intervention is None or intervention.transfer is None:
-            return self.transfer
-        return intervention.transfer
+        """The config of a policy retrained in ``setting``, with the overrides of its only knob."""
+        return self._of("transfer", setting)
 
-    def _intervention(self, setting: Setting) -> InterventionConfig | None:
-        """The listed values of the setting's knob; None if it changes none or several."""
-        return self.interventions.get(setting.knobs[0]) if len(setting.knobs) == 1 else None
+    def _of(self, section: str, setting: Setting) -> Any:
+        only = self.interventions.get(setting.knobs[0]) if len(setting.knobs) == 1 else None
+        own = getattr(only, section, None)
+        return getattr(self, section) if own is None else own

@@ -41,7 +41,7 @@ def write_table(table: pa.Table, path: Path) -> None:
         file.write_table(table, row_group_size=max(1, table.num_rows))
 
 
-def open_table(path: Path, texts: Sequence[str] = (), buffered: bool = False) -> pq.ParquetFile:
+def open_table(path: Path, texts: Sequence[str] = ()) -> pq.ParquetFile:
     """Open ``path`` and check its footer; no column is read yet.
 
     The columns ``texts`` are read as dictionaries: a long text repeated in every row then takes

@@ -37,8 +37,7 @@ class _Wrong(Exception):
 def check(
     spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]], seed: int = 0
 ) -> Iterator[Found]:
-    """Every check of ``spec``, one after the other. Those after one that no other can do without
-    are left out if it fails.
+    """Every check of ``spec``, in order. If the environment cannot be made, the others are skipped.
 
     Args:
         spec: a known environment.

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 import gymnasium
@@ -195,5 +196,4 @@ def transition_reward(env: str) -> Callable[..., np.ndarray] | None:
     name = environment(env).transition_reward
     if name is None:
         return None
-    module, _, function = name.partition(":")
-    return getattr(import_module(module), function)
+    return resolve_name(name)

@@ -78,7 +78,7 @@ class Run(NamedTuple):
 
     Attributes:
         agent: the method or the variant, as the report's cells call it.
-        shared: what the names of the steps begin with that other seeds have as well.
+        shared: the part of the steps' names that all seeds share.
         configs: those of the variant.
     """
 

@@ -1,7 +1,6 @@
 """Learners turn demonstrations into a reward. Importing this loads no torch."""
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any, NamedTuple
 
 
@@ -28,5 +27,6 @@ LEARNERS = {
 
 def learner(name: str) -> Any:
     """The learner class called ``name``, one of :data:`LEARNERS`."""
-    module, _, attribute = LEARNERS[name].place.partition(":")
-    return getattr(import_module(module), attribute)
+    from pkgutil import resolve_name
+
+    return resolve_name(LEARNERS[name].place)

@@ -3,7 +3,7 @@
 Algorithm 1, as this module reads from top to bottom. In every round
 
 1. the policy acts and is updated on the discriminator's reward (:meth:`AIRL.rewards`), and a
-   challenger, if there is one, on the reward alone (:class:`irlcli.learners.frozen.Pay`);
+   challenger, if there is one, on the reward alone (:meth:`AIRL.challenger_rewards`);
 2. the round's episodes become samples labelled *policy*, the demonstrations samples labelled
    *expert*, grouped into risks (:meth:`AIRL.update`);
 3. the discriminator minimises :func:`discriminator_loss`, the mean of the risks' cross-entropies

@@ -66,8 +66,8 @@ def discriminator_loss(
     """(share sum_e w_e BCE_e + beside + lambda penalty) / max(1, lambda) (paper Eq. 5, Algorithm 1).
 
     The paper sums over settings where this averages. Dividing by lambda keeps the gradient's size
-    when the penalty dominates. Challengers are not part of the penalty: they are told from experts
-    so easily that it would be small for any reward.
+    when the penalty dominates. Penalties of risks do not see challengers, which are told from
+    experts so easily that the penalty would be small for any reward; ``input-gradient`` does.
 
     Args:
         logits: f - log pi [E, 2, B].

@@ -10,7 +10,7 @@ from irlcli.report.agents import title
 from irlcli.report.build import Report
 from irlcli.report.lineage import commits, duration, evaluations, lineage
 from irlcli.report.parameters import Parameters
-from irlcli.report.tables import Table, latex_table, markdown_table
+from irlcli.report.tables import REWARD_QUALITY, Table, latex_table, markdown_table
 from irlcli.report.text import number
 
 _RETURNS = "Every seed, the mean and its 95 % bootstrap interval."
@@ -34,7 +34,7 @@ def markdown(p: Parameters, report: Report) -> str:
         parts.append("".join(f"- {caveat}\n" for caveat in report.caveats))
     for table in report.tables:
         parts += [f"## {table.title}\n", markdown_table(table.columns, table.rows)]
-        if table.title == "Reward quality":
+        if table.title == REWARD_QUALITY:
             rows = dict.fromkeys(report.reward_quality["row"])
             parts += [f"![{row}](bank-{row.replace(' ', '-')}.png)\n" for row in rows]
         parts += [table.note + "\n"] if table.note else []

@@ -14,7 +14,7 @@ from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
 from irlcli.report.compute import failed_to_imitate
 from irlcli.report.lineage import commits, duration, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
-from irlcli.report.tables import Table
+from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
 from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
@@ -245,7 +245,7 @@ def reward_quality(found: pd.DataFrame) -> Table:
             ]
         )
     columns = ["row", "setting", "method", "seeds", "Spearman", "lower half", "expert - idle"]
-    return Table("Reward quality", _QUALITY_NOTE, [*columns, *get_args(Verdict)], lines, heads=3)
+    return Table(REWARD_QUALITY, _QUALITY_NOTE, [*columns, *get_args(Verdict)], lines, heads=3)
 
 
 def _spread(values: pd.Series) -> str:
@@ -331,7 +331,7 @@ def cells(found: pd.DataFrame) -> Table:
     ]
     columns = ["row", "agent", "measure", "seeds", "mean", "sd", "95 %", "IQM"]
     columns += ["retrainings", "progress"]
-    return Table("Every cell", _CELL_NOTE, columns, lines, heads=3)
+    return Table(EVERY_CELL, _CELL_NOTE, columns, lines, heads=3)
 
 
 def budgets(p: Parameters) -> Table:

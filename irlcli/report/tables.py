@@ -3,6 +3,9 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+# Titles by which the pages and the terminal find a table.
+EVERY_CELL = "Every cell"
+REWARD_QUALITY = "Reward quality"
 # LaTeX cuts off a float that is longer than a page.
 _PAGE_ROWS = 40
 _LATEX = {

@@ -3,7 +3,6 @@
 Importing it loads neither torch nor stable-baselines3.
 """
 
-from importlib import import_module
 from typing import Any
 
 # Name to module and class, one line each. A class takes (worlds, config, total_steps, seed, purpose)
@@ -16,5 +15,6 @@ ALGORITHMS = {
 
 def algorithm(name: str) -> Any:
     """The trainer class called ``name``, one of :data:`ALGORITHMS`."""
-    module, _, attribute = ALGORITHMS[name].partition(":")
-    return getattr(import_module(module), attribute)
+    from pkgutil import resolve_name
+
+    return resolve_name(ALGORITHMS[name])

@@ -71,7 +71,7 @@ def request(problem: str, labels: CuedLabelsConfig) -> Request:
     """Train :func:`methods` on ``problem``. Outputs ``accuracy.parquet``, a row per method and seed.
 
     Raises:
-        UsageError: fewer than two settings to train on.
+        UsageError: fewer than two settings to train on, or a warm-up as long as the training.
     """
     if len(labels.strengths) < 2:
         raise UsageError(

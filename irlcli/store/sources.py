@@ -61,8 +61,8 @@ def open_sources(places: Iterable[Path | str], warn: Callable[[str], None]) -> l
 def find_in(stores: Sequence[Place], key: str) -> Found | None:
     """The artefact of ``key`` in the first of ``stores`` that has it; None if none has.
 
-    Checks the manifest and the sizes; hashes nothing. An artefact that is damaged or of a newer
-    schema is skipped with a warning.
+    Checks the manifest, and in a directory the sizes; hashes nothing. An artefact that is damaged or
+    of a newer schema is skipped with a warning.
     """
     for store in stores:
         try:

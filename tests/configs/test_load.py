@@ -491,7 +491,9 @@ def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():
 def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):
     assert load_config(LANDER).transfer.ceiling == 0.9
     assert load_config(LANDER, file=toml('[transfer]\nceiling = "none"')).transfer.ceiling is None
-    lifted = toml('[interventions.bounce]\nid = ["0.1"]\n[interventions.bounce.transfer]\nceiling = "none"')
+    lifted = toml(
+        '[interventions.bounce]\nid = ["0.1"]\n[interventions.bounce.transfer]\nceiling = "none"'
+    )
     (bounce,) = parse_settings(LANDER, "bounce=0.1")
     assert load_config(LANDER).transfer_of(bounce).ceiling == 0.9
     assert load_config(LANDER, file=lifted).transfer_of(bounce).ceiling is None

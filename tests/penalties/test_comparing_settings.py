@@ -25,7 +25,9 @@ UNIFORM = torch.full((E,), 1 / E, dtype=torch.float64)
 def of_risks(risks, weights=None):
     """Samples of which only the risks matter."""
     risks = torch.as_tensor(risks, dtype=torch.float64)
-    weights = torch.full_like(risks, 1 / len(risks)) if weights is None else torch.as_tensor(weights)
+    weights = (
+        torch.full_like(risks, 1 / len(risks)) if weights is None else torch.as_tensor(weights)
+    )
     return Samples(torch.zeros(len(risks), 2, 2), torch.zeros(len(risks), 2, 2), risks, weights)
 
 
@@ -83,7 +85,9 @@ def test_group_dro_keeps_the_share_that_challengers_leave_to_the_risks():
     )
     assert total.item() == pytest.approx(0.45)
     # Challengers may leave nothing.
-    assert group_dro.discriminator(of_risks([0.3, 0.1], [0.0, 0.0]), PenaltyOptions(weight=50.0)) == 0
+    assert (
+        group_dro.discriminator(of_risks([0.3, 0.1], [0.0, 0.0]), PenaltyOptions(weight=50.0)) == 0
+    )
 
 
 def test_iga_of_a_linear_model_is_the_variance_of_its_gradients(linear):
