@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,10 @@ from irlcli.stages.base import (
 )
 
 if TYPE_CHECKING:
+    from irlcli.learners.airl import AIRL
+    from irlcli.learners.selection import BestRound
+    from irlcli.rl.loop import LastRound
+    from irlcli.rl.worlds import Worlds
     from irlcli.trajectories import Trajectory
 
 
@@ -139,98 +143,31 @@ def _trained(airl: AIRLConfig, settings: Sequence[str]) -> tuple[str, ...]:
 
 def run(job: Job) -> None:
     """Alternate policy rounds and discriminator rounds, all settings together."""
-    import numpy as np
-
-    from irlcli.data import descriptions
-    from irlcli.data.demonstrations import read_demonstrations
+    from irlcli.data.descriptions import Selected
     from irlcli.data.outputs import write_metrics, write_policy, write_reward
-    from irlcli.learners import learner as learner_class
-    from irlcli.learners.selection import BestRound, hold_out, log_likelihood
-    from irlcli.learners.stopping import cross_entropies, plateaued
+    from irlcli.learners.selection import BestRound
     from irlcli.rl.challengers import Challengers
-    from irlcli.rl.loop import LastRound, Training
+    from irlcli.rl.loop import Training
     from irlcli.rl.ppo import PPOTrainer
-    from irlcli.rl.rollout import roll_out
-    from irlcli.rl.worlds import action_space, make_worlds, observation_size
+    from irlcli.rl.worlds import make_worlds
 
     p: Parameters = job.parameters
     env, airl = p.environment.name, p.airl
-    demos = read_demonstrations(job.inputs["demonstrations"])
-    demos.require(env, p.settings)
     settings = _trained(airl, p.settings)
-    episodes: list[Sequence[Trajectory]] = [demos.trajectories[text] for text in settings]
-    held_out: list[Sequence[Trajectory]] = []
-    if airl.select == "episodes":
-        try:
-            parts = [hold_out(group) for group in episodes]
-            episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
-        except ValueError as error:
-            raise UsageError(str(error), "select by a setting, or record more episodes") from None
-    if airl.grouping == "shuffled" and (len(settings) == 1 or max(map(len, episodes)) == 1):
-        job.console.warn(
-            "shuffling changes nothing with one setting or with one demonstration of each: this is "
-            "no control"
-        )
+    episodes, held_out = _episodes(job, settings)
     parsed = [parse_setting(env, text) for text in settings]
     with closing(make_worlds(env, parsed, airl.ppo.n_envs, job.workers)) as worlds:
-        size = observation_size(worlds.observation_space)
-        beyond = [column for column in airl.columns or () if not -size <= column < size]
-        if beyond:
-            raise UsageError(
-                f"airl.columns: {beyond[0]} is no entry of the {size} of an observation in {env} "
-                f"{settings[0]}",
-                f"name some of {-size} to {size - 1}",
-            )
         trainer = PPOTrainer(
             worlds, airl.ppo, airl.total_steps, p.seed, STAGE.name, keep_moments=airl.bc_epochs > 0
         )
-        try:
-            learner = learner_class(airl.learner)(
-                episodes,
-                airl,
-                worlds=len(worlds),
-                rounds=trainer.rounds,
-                horizon=p.environment.max_episode_steps,
-                observation_size=size,
-                actions=action_space(worlds.action_space),
-                seed=p.seed,
-            )
-        except ValueError as error:
-            raise IntegrityError(f"{env}: {error}") from None
-
-        def likelihood(policy) -> float:
-            return log_likelihood(policy, learner.view, held_out)
-
-        def true_return(policy) -> float:
-            # From the same first states in every round.
-            where = parse_setting(env, airl.select)
-            found = roll_out(env, where, policy, airl.select_episodes, p.seed, "selection")
-            return float(np.mean([t.episode_return for t in found]))
-
-        selector: LastRound | BestRound = LastRound()
-        if airl.select != "last":
-            score = likelihood if airl.select == "episodes" else true_return
-            selector = BestRound(score, learner, airl.select_every, trainer.rounds)
+        learner = _learner(p, settings, episodes, worlds, trainer.rounds)
+        selector = _selector(p, learner, held_out, trainer.rounds)
         challengers = None
         if airl.challenger.life > 0:
             challengers = Challengers(worlds, airl.challenger, learner, p.seed, STAGE.name)
-
-        def at_a_plateau(rows: Sequence[Mapping[str, Any]]) -> bool:
-            if isinstance(airl.plateau_rounds, msgspec.UnsetType):
-                return False
-            # Until then the loss itself changes.
-            first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
-            newest = rows[-2 * airl.plateau_rounds * len(settings) :]
-            return plateaued(cross_entropies(newest, first), airl.plateau_rounds)
-
-        training = Training(
-            trainer, learner, learner, selector, settings, challengers, at_a_plateau
-        )
+        stop = _at_a_plateau(airl, len(settings))
+        training = Training(trainer, learner, learner, selector, settings, challengers, stop)
         rows = run_training(job, training)
-    selected = None
-    if isinstance(selector, BestRound):
-        best = selector.best
-        selected = descriptions.Selected(round=best["round"], score=best["score"])
     stopped = training.rounds_done if training.rounds_done < trainer.rounds else None
     origin = {
         "env": env,
@@ -239,8 +176,116 @@ def run(job: Job) -> None:
         "seed": p.seed,
     }
     write_policy(job.output, trainer.policy, airl.ppo, agent="student", **origin)
+    selected = None
+    if isinstance(selector, BestRound):
+        selected = Selected(round=selector.best["round"], score=selector.best["score"])
     write_reward(job.output, learner, airl=airl, selected=selected, stopped_after=stopped, **origin)
     write_metrics(job.output, rows)
+
+
+def _episodes(
+    job: Job, settings: Sequence[str]
+) -> tuple[list[Sequence[Trajectory]], list[Sequence[Trajectory]]]:
+    """The demonstrations of each of ``settings``, and those that are held out to select by."""
+    from irlcli.data.demonstrations import read_demonstrations
+    from irlcli.learners.selection import hold_out
+
+    p: Parameters = job.parameters
+    demos = read_demonstrations(job.inputs["demonstrations"])
+    demos.require(p.environment.name, p.settings)
+    episodes: list[Sequence[Trajectory]] = [demos.trajectories[text] for text in settings]
+    held_out: list[Sequence[Trajectory]] = []
+    if p.airl.select == "episodes":
+        try:
+            parts = [hold_out(group) for group in episodes]
+        except ValueError as error:
+            raise UsageError(str(error), "select by a setting, or record more episodes") from None
+        episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
+    if p.airl.grouping == "shuffled" and (len(settings) == 1 or max(map(len, episodes)) == 1):
+        job.console.warn(
+            "shuffling changes nothing with one setting or with one demonstration of each: this is "
+            "no control"
+        )
+    return episodes, held_out
+
+
+def _learner(
+    p: Parameters,
+    settings: Sequence[str],
+    episodes: Sequence[Sequence[Trajectory]],
+    worlds: Worlds,
+    rounds: int,
+) -> AIRL:
+    """The learner of ``p``, before its first round."""
+    from irlcli.learners import learner
+    from irlcli.rl.worlds import action_space, observation_size
+
+    env, airl = p.environment.name, p.airl
+    size = observation_size(worlds.observation_space)
+    beyond = [column for column in airl.columns or () if not -size <= column < size]
+    if beyond:
+        raise UsageError(
+            f"airl.columns: {beyond[0]} is no entry of the {size} of an observation in {env} "
+            f"{settings[0]}",
+            f"name some of {-size} to {size - 1}",
+        )
+    try:
+        return learner(airl.learner)(
+            episodes,
+            airl,
+            worlds=len(worlds),
+            rounds=rounds,
+            horizon=p.environment.max_episode_steps,
+            observation_size=size,
+            actions=action_space(worlds.action_space),
+            seed=p.seed,
+        )
+    except ValueError as error:
+        raise IntegrityError(f"{env}: {error}") from None
+
+
+def _selector(
+    p: Parameters, learner: AIRL, held_out: Sequence[Sequence[Trajectory]], rounds: int
+) -> LastRound | BestRound:
+    """What decides which round is kept, by ``airl.select``."""
+    import numpy as np
+
+    from irlcli.learners.selection import BestRound, log_likelihood
+    from irlcli.rl.loop import LastRound
+    from irlcli.rl.rollout import roll_out
+
+    airl = p.airl
+    if airl.select == "last":
+        return LastRound()
+
+    def likelihood(policy: Any) -> float:
+        return log_likelihood(policy, learner.view, held_out)
+
+    def true_return(policy: Any) -> float:
+        # From the same first states in every round.
+        where = parse_setting(p.environment.name, airl.select)
+        found = roll_out(
+            p.environment.name, where, policy, airl.select_episodes, p.seed, "selection"
+        )
+        return float(np.mean([t.episode_return for t in found]))
+
+    score = likelihood if airl.select == "episodes" else true_return
+    return BestRound(score, learner, airl.select_every, rounds)
+
+
+def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping[str, Any]]], bool]:
+    """The rule that stops before the last round, as a function of the rows so far."""
+    from irlcli.learners.stopping import cross_entropies, plateaued
+
+    def stop(rows: Sequence[Mapping[str, Any]]) -> bool:
+        if isinstance(airl.plateau_rounds, msgspec.UnsetType):
+            return False
+        # Until then the loss itself changes.
+        first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
+        newest = rows[-2 * airl.plateau_rounds * settings :]
+        return plateaued(cross_entropies(newest, first), airl.plateau_rounds)
+
+    return stop
 
 
 STAGE = Stage("train-airl", 5, run)
