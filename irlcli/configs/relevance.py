@@ -79,6 +79,22 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         raise UsageError(
             f"airl.actions = {airl.actions} needs continuous actions", "omit airl.actions"
         )
+    airl = _penalty(airl)
+    airl = _network(airl)
+    airl = _kept_rounds(airl)
+    if airl.grouping == "pooled":
+        airl = replace(airl, pairing=_AIRL.pairing)
+    if airl.logit == "f":
+        # f is all that w could multiply.
+        airl = replace(airl, penalty_scaling=_AIRL.penalty_scaling)
+    if not airl.shaping and airl.policy_reward == "g":
+        airl = replace(airl, policy_reward="f")
+    airl = _challenger(airl, discrete_actions)
+    airl = _replay(airl)
+    return replace(airl, ppo=relevant_ppo(airl.ppo, discrete_actions, "airl.ppo"))
+
+
+def _penalty(airl: AIRLConfig) -> AIRLConfig:
     if airl.penalty == "none" or airl.penalty_weight == 0.0:
         airl = replace(
             airl,
@@ -97,12 +113,21 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         airl = replace(airl, penalty_ramp_rounds=max(1, airl.penalty_ramp_rounds))
         unread = {"penalty_scaling", "penalty_estimate"} - {*PENALTIES[airl.penalty].reads}
         airl = replace(airl, **{name: getattr(_AIRL, name) for name in unread})
+    return airl
+
+
+def _network(airl: AIRLConfig) -> AIRLConfig:
     if not airl.hidden:
         airl = replace(airl, activation=_AIRL.activation, dropout=UNSET)
     if not airl.dropout:
         airl = replace(airl, dropout=UNSET)
     if not airl.columns:
         airl = replace(airl, columns=UNSET)
+    return airl
+
+
+def _kept_rounds(airl: AIRLConfig) -> AIRLConfig:
+    """Refuses two ways at once to choose the rounds that are kept."""
     if airl.averaged_rounds in (UNSET, 1):
         airl = replace(airl, averaged_rounds=UNSET)
     elif airl.select != "last":
@@ -122,43 +147,42 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
                     f"= {value}: that takes the whole budget",
                     f"omit airl.plateau_rounds or airl.{name}",
                 )
-    if airl.grouping == "pooled":
-        airl = replace(airl, pairing=_AIRL.pairing)
-    if airl.logit == "f":
-        # f is all that w could multiply.
-        airl = replace(airl, penalty_scaling=_AIRL.penalty_scaling)
-    if not airl.shaping and airl.policy_reward == "g":
-        airl = replace(airl, policy_reward="f")
-    if airl.challenger.life == 0:
-        airl = replace(airl, challenger=_AIRL.challenger)
-    else:
-        if airl.logit != "f":
-            raise UsageError(
-                f"airl.challenger.life = {airl.challenger.life} needs logits without log pi: past "
-                "challengers, whose log pi they would hold, are gone",
-                "--set airl.logit=f, and --set airl.policy_reward to f or g",
-            )
-        # Before what follows from the number of worlds: a minibatch is at most a rollout.
-        ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
-        ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
-        share = airl.challenger.mixed_share or UNSET
-        airl = replace(airl, challenger=replace(airl.challenger, ppo=ppo, mixed_share=share))
-    if airl.replay_share == 0.0:
-        airl = replace(
-            airl,
-            replay_episodes_per_round=_AIRL.replay_episodes_per_round,
-            replay_capacity=_AIRL.replay_capacity,
-            challenger=replace(
-                airl.challenger,
-                replay_episodes_per_round=_AIRL.challenger.replay_episodes_per_round,
-                replay_capacity=_AIRL.challenger.replay_capacity,
-            ),
-        )
     if airl.select == "last":
         airl = replace(airl, select_every=_AIRL.select_every)
     if airl.select in ("last", "episodes"):
         airl = replace(airl, select_episodes=_AIRL.select_episodes)
-    return replace(airl, ppo=relevant_ppo(airl.ppo, discrete_actions, "airl.ppo"))
+    return airl
+
+
+def _challenger(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
+    if airl.challenger.life == 0:
+        return replace(airl, challenger=_AIRL.challenger)
+    if airl.logit != "f":
+        raise UsageError(
+            f"airl.challenger.life = {airl.challenger.life} needs logits without log pi: past "
+            "challengers, whose log pi they would hold, are gone",
+            "--set airl.logit=f, and --set airl.policy_reward to f or g",
+        )
+    # Before what follows from the number of worlds: a minibatch is at most a rollout.
+    ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
+    ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
+    share = airl.challenger.mixed_share or UNSET
+    return replace(airl, challenger=replace(airl.challenger, ppo=ppo, mixed_share=share))
+
+
+def _replay(airl: AIRLConfig) -> AIRLConfig:
+    if airl.replay_share > 0.0:
+        return airl
+    return replace(
+        airl,
+        replay_episodes_per_round=_AIRL.replay_episodes_per_round,
+        replay_capacity=_AIRL.replay_capacity,
+        challenger=replace(
+            airl.challenger,
+            replay_episodes_per_round=_AIRL.challenger.replay_episodes_per_round,
+            replay_capacity=_AIRL.challenger.replay_capacity,
+        ),
+    )
 
 
 def relevant_transfer(
