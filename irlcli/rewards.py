@@ -137,6 +137,7 @@ def load_reward(
     from irlcli.envs.registry import resolve
     from irlcli.errors import UsageError
     from irlcli.experiments.references import tensor_file
+    from irlcli.experiments.status import checked
     from irlcli.stages.base import environment_key, frozen_reward
 
     if gamma is not None and not 0.0 <= gamma < 1.0:
@@ -147,10 +148,7 @@ def load_reward(
         resolve(env)
     opened = Store(Path(store))
     source, description = tensor_file(opened, str(ref), "reward")
-    path = source.path
-    if source.artefact is not None:
-        path = opened.open(source.artefact, path.name)
-    model, description = load_reward_file(path)
+    model, description = load_reward_file(checked(opened, source))
     where = environment_key(description.env)
     frozen = frozen_reward(
         where, setting or description.settings[0], model, description, ceiling, gamma

@@ -14,7 +14,7 @@ from irlcli.cli.options import Ref, store_command
 from irlcli.cli.session import Session
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
-from irlcli.stages.base import Source
+from irlcli.experiments.status import checked
 
 
 @store_command
@@ -45,7 +45,7 @@ def export(
 
 def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
-    directory = _checked(session, source)
+    directory = checked(session.store, source)
     with _new_file(Path(name)) as path:
         from irlcli.data.exchange.transitions import write_transitions
         from irlcli.data.streaming import read_stream
@@ -57,7 +57,7 @@ def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
 
 def _demos_to_minari(session: Session, ref: str, name: str) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
-    directory = _checked(session, source)
+    directory = checked(session.store, source)
     dataset = references.minari_directory(name).parent
     if dataset.exists():
         raise UsageError(f"Minari has a dataset {name!r} already", "raise its version: -v1")
@@ -89,17 +89,6 @@ def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
         reward = load_reward(ref, session.store.root)
         write_reward(path, reward.module(), reward.about())
     return Path(name)
-
-
-def _checked(session: Session, source: Source) -> Path:
-    """Where ``source`` lies, after its bytes were compared with their digests."""
-    if source.artefact is None:
-        return source.path
-    if source.path != source.artefact.directory:
-        return session.store.open(source.artefact, source.path.name)
-    for output in source.artefact.manifest.outputs:
-        session.store.open(source.artefact, output.path)
-    return source.path
 
 
 @contextmanager

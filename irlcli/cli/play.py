@@ -14,6 +14,7 @@ from irlcli.cli.session import Session
 from irlcli.configs import load_config
 from irlcli.errors import UsageError
 from irlcli.experiments import references
+from irlcli.experiments.status import checked
 from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.requests import arguments
 from irlcli.stages.base import Source
@@ -76,7 +77,7 @@ def play(
     from irlcli.data.tensors import load_policy_file
     from irlcli.report.animation import film, write_gif, write_mp4
 
-    player, _ = load_policy_file(_path(session, source))
+    player, _ = load_policy_file(checked(session.store, source))
     rewards = None if scored_by is None else _rewards(session, scored_by[0], env, settings)
     try:
         played = film(player, env, settings, steps, seed, rewards)
@@ -107,12 +108,6 @@ def _scored_by(session: Session, policy: Source, ref: str | None) -> "tuple[Sour
     return references.reward_behind(session.store, policy)
 
 
-def _path(session: Session, source: Source) -> Path:
-    if source.artefact is None:
-        return source.path
-    return session.store.open(source.artefact, source.path.name)
-
-
 def _rewards(
     session: Session, source: Source, env: str, settings: Sequence[Setting]
 ) -> "list[FrozenReward]":
@@ -120,6 +115,6 @@ def _rewards(
     from irlcli.data.tensors import load_reward_file
     from irlcli.stages.base import environment_key, frozen_reward
 
-    model, origin = load_reward_file(_path(session, source))
+    model, origin = load_reward_file(checked(session.store, source))
     where = environment_key(env, settings)
     return [frozen_reward(where, str(setting), model, origin) for setting in settings]

@@ -58,6 +58,8 @@ class Session(base.Session):
 class StageSession(base.StageSession):
     """A session that plans and runs stages, and prints the plan or the artefacts."""
 
+    console: out.TerminalConsole
+
     def __init__(
         self,
         store: Path,

@@ -3,12 +3,11 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any
 
 from irlcli.errors import Interrupted
 from irlcli.experiments import provenance
 from irlcli.experiments.signals import stop_requests
-from irlcli.stages.base import Stage
+from irlcli.stages.base import Console, Stage
 from irlcli.store import Scratch
 
 
@@ -24,7 +23,7 @@ class StageCheckpoints:
         seconds: least time between two checkpoints [s].
     """
 
-    def __init__(self, stage: Stage, scratch: Scratch, console: Any, seconds: float):
+    def __init__(self, stage: Stage, scratch: Scratch, console: Console, seconds: float):
         self._stage = stage
         self._libraries = provenance.libraries()
         self._clock = provenance.Clock()

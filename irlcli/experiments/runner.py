@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed
 from irlcli.experiments.introduce import described
-from irlcli.experiments.status import Lookup, Step, key_record, source_in, source_of
+from irlcli.experiments.status import Lookup, Step, checked, key_record, source_in, source_of
 from irlcli.stages.base import Console, From, Job, Request, Source
 from irlcli.store import Artefact, KeyRecord, Resolved, Store
 
@@ -24,8 +24,30 @@ __all__ = ["Runner", "Silent", "Step", "source_of"]
 CHECKPOINT_SECONDS = 10.0
 
 
-class Silent(Console):
-    """A console that shows nothing. Any other console has the same methods."""
+class RunConsole(Console, Protocol):
+    """What a runner and a session tell the user, beside what their stages do."""
+
+    def start(self, label: str, resumed: bool) -> None:
+        """A stage starts; ``resumed`` from a checkpoint or not."""
+
+    def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
+        """A stage ended, or its artefact existed (``hit``)."""
+
+    def found(self, label: str, artefact: Artefact, where: Path | str) -> None:
+        """An artefact was copied from the store ``where``."""
+
+    def wait(self, label: str, holder: str) -> None:
+        """Another process makes the same artefact, or runs gc."""
+
+    def say(self, text: str) -> None:
+        """A line that is no warning."""
+
+    def close(self) -> None:
+        """Nothing follows for now."""
+
+
+class Silent(RunConsole):
+    """A console that shows nothing."""
 
     def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
         pass
@@ -46,6 +68,12 @@ class Silent(Console):
         pass
 
     def wait(self, label: str, holder: str) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        pass
+
+    def close(self) -> None:
         pass
 
 
@@ -80,7 +108,7 @@ class Runner:
     def __init__(
         self,
         store: Store | Path | str,
-        console: Any = None,
+        console: RunConsole | None = None,
         wait: bool = True,
         command: list[str] | None = None,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
@@ -88,7 +116,7 @@ class Runner:
         sources: "Sequence[Place]" = (),
     ):
         self.store = store if isinstance(store, Store) else Store(store)
-        self.console = console if console is not None else Silent()
+        self.console = Silent() if console is None else console
         self.wait = wait
         self.command = command or []
         self.checkpoint_seconds = checkpoint_seconds
@@ -235,20 +263,14 @@ class Runner:
 
     def _checked(self, source: Source) -> Path:
         """The path of an input whose bytes have the digest that the key holds."""
-        if source.artefact is None:
-            # It was hashed when the run was planned, which may be hours ago.
-            if source_of(Resolved(None, source.path)).sha256 != source.sha256:
-                raise IntegrityError(
-                    f"{source.path} changed after this run was planned",
-                    "run the same command again",
-                )
-            return source.path
-        if source.path != source.artefact.directory:
-            relative = source.path.relative_to(source.artefact.directory).as_posix()
-            return self.store.open(source.artefact, relative)
-        for output in source.artefact.manifest.outputs:
-            self.store.open(source.artefact, output.path)
-        return source.path
+        # A foreign file was hashed when the run was planned, which may be hours ago.
+        foreign = source_of(Resolved(None, source.path)) if source.artefact is None else source
+        if foreign.sha256 != source.sha256:
+            raise IntegrityError(
+                f"{source.path} changed after this run was planned",
+                "run the same command again",
+            )
+        return checked(self.store, source)
 
 
 def _address(source: Source) -> str:

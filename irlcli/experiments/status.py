@@ -168,6 +168,24 @@ def source_in(artefact: Artefact, output: str | None) -> Source:
     return Source(artefact.directory / output, artefact.output(output).sha256, artefact)
 
 
+def checked(store: Store, source: Source) -> Path:
+    """Where ``source`` lies, after its bytes in ``store`` were compared with their digests.
+
+    A file outside a store is not compared.
+
+    Raises:
+        IntegrityError: the bytes differ.
+    """
+    artefact = source.artefact
+    if artefact is None:
+        return source.path
+    if source.path != artefact.directory:
+        return store.open(artefact, source.path.relative_to(artefact.directory).as_posix())
+    for output in artefact.manifest.outputs:
+        store.open(artefact, output.path)
+    return source.path
+
+
 def source_of(resolved: Resolved) -> Source:
     """A resolved reference as a stage's input.
 

@@ -14,7 +14,7 @@ DEFAULT_STORE, DEFAULT_PROFILE = Path("runs"), "standard"
 
 if TYPE_CHECKING:
     from irlcli.configs import Config
-    from irlcli.experiments.runner import Runner
+    from irlcli.experiments.runner import RunConsole, Runner
     from irlcli.stages.base import Request
 
 
@@ -23,8 +23,7 @@ class Session:
 
     Args:
         store: its directory.
-        console: receives progress and warnings, as :class:`irlcli.experiments.runner.Silent` does,
-            and the lines of ``say(text)``.
+        console: receives progress and warnings.
         wait: wait for other processes, instead of raising Busy.
         read_only: nothing is written to the store.
 
@@ -32,7 +31,9 @@ class Session:
         UsageError: ``store`` is a URL.
     """
 
-    def __init__(self, store: Path, console: Any, wait: bool = True, read_only: bool = False):
+    def __init__(
+        self, store: Path, console: "RunConsole", wait: bool = True, read_only: bool = False
+    ):
         # As a path it would be a directory here: a path has no empty parts, so `//` became `/`.
         if re.match(r"[A-Za-z][\w+.-]+:/", str(store)):
             raise UsageError(
@@ -85,7 +86,7 @@ class StageSession(Session):
     def __init__(
         self,
         store: Path,
-        console: Any,
+        console: "RunConsole",
         *,
         profile: str,
         file: Path | None,
