@@ -13,7 +13,7 @@ from irlcli.experiments import bank, references
 from irlcli.interventions import parse_setting
 from irlcli.requests import arguments
 from irlcli.stages import assess as stage
-from irlcli.stages.train_airl import describe
+from irlcli.stages.train_airl import reward_label
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def assess(
         source,
         env,
         bank.bank(env, settings, config, policies, seed),
-        f"{describe(origin.airl)} seed {origin.seed}",
+        reward_label(origin.airl, origin.seed),
     )
 
     def found(artefact: Artefact) -> Assessment:

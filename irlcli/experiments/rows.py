@@ -175,6 +175,29 @@ class _RowRequests:
         return f"{self.row}.{name}", request
 
 
+class _Reward(NamedTuple):
+    """A reward of a row, or a clone in its place, and what its tasks depend on.
+
+    Attributes:
+        requests: of its row, under its own configs.
+        demos, learned: what it is learned from, and what learns it.
+        measures: of the table.
+    """
+
+    requests: _RowRequests
+    demos: Request
+    learned: Request
+    run: Run
+    measures: Sequence[str]
+
+    @property
+    def label(self) -> str:
+        return train_airl.reward_label(self.learned.parameters.airl, self.run.seed)
+
+    def cell(self, measure: str, place: str = "", **kwargs: Any) -> Cell:
+        return self.requests.cell(self.run.agent, measure, self.run.seed, place, **kwargs)
+
+
 def comparison(
     row: Row,
     measures: Sequence[str],
@@ -201,27 +224,7 @@ def comparison(
     yield from requests.expert_tasks([*trained, *unseen])
     demos = collect_experts.request(row.env, trained, requests.config, 0, requests.listed.episodes)
     yield Task(f"{row}.demos", "demos", demos)
-    place = str(unseen[0])
-    for agent in ("random", "idle"):
-        cell = requests.cell(agent, "ood", place=place)
-        request = requests.returns(unseen, None, agent)
-        yield Task(f"{row}.{agent}-returns", "returns", request, cell)
-    name, request = requests.own_returns(unseen[0])
-    yield Task(name, "returns", request, requests.cell("expert", "ood", place=place))
-    for e in trained:
-        expert, label = requests.expert(e), f"expert of {e}"
-        in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
-        if in_distribution:
-            name, request = requests.own_returns(e)
-            yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
-        # Where one expert demonstrates everywhere, it is nothing beside the setting's own.
-        reused = (("ood", unseen), ("id", trained)) if expert != requests.expert(unseen[0]) else ()
-        for measure, places in reused:
-            if measure == "ood" or in_distribution:
-                name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
-                request = requests.returns(places, expert, policy_label=label)
-                cell = requests.cell("reused", measure, place=str(e))
-                yield Task(name, "returns", request, cell)
+    yield from _without_reward(requests, measures)
     under = {configs: requests}
     for run in runs:
         try:
@@ -234,6 +237,32 @@ def comparison(
             raise UsageError(f"variant {run.agent!r}: {error.message}", error.hint) from None
 
 
+def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator[Task]:
+    """What the experts, the random and the idle agent earn."""
+    row, trained, unseen = requests.row, requests.trained, requests.unseen
+    place = str(unseen[0])
+    for agent in ("random", "idle"):
+        cell = requests.cell(agent, "ood", place=place)
+        request = requests.returns(unseen, None, agent)
+        yield Task(f"{row}.{agent}-returns", "returns", request, cell)
+    name, request = requests.own_returns(unseen[0])
+    yield Task(name, "returns", request, requests.cell("expert", "ood", place=place))
+    in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
+    for e in trained:
+        expert, label = requests.expert(e), f"expert of {e}"
+        if in_distribution:
+            name, request = requests.own_returns(e)
+            yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
+        # Where one expert demonstrates everywhere, it is nothing beside the setting's own.
+        reused = (("ood", unseen), ("id", trained)) if expert != requests.expert(unseen[0]) else ()
+        for measure, places in reused:
+            if measure == "ood" or in_distribution:
+                name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
+                request = requests.returns(places, expert, policy_label=label)
+                cell = requests.cell("reused", measure, place=str(e))
+                yield Task(name, "returns", request, cell)
+
+
 def _run(
     requests: _RowRequests,
     demos: Request,
@@ -243,12 +272,11 @@ def _run(
     chosen: Chosen,
 ) -> Iterator[Task]:
     """One method or variant with one seed: the reward, and what its policies earn."""
-    env, unseen, trained = requests.row.env, requests.unseen, requests.trained
-    name, agent, seed = run.name, run.agent, run.seed
+    env, trained = requests.row.env, requests.trained
     if not method(run.method).learns_reward:
-        cloned = clone.request(From(demos), env, trained, requests.config, seed)
-        yield Task(name, "rewards", cloned)
-        yield from _imitation(requests, cloned, run, measures, {})
+        cloned = clone.request(From(demos), env, trained, requests.config, run.seed)
+        yield Task(run.name, "rewards", cloned)
+        yield from _imitation(_Reward(requests, demos, cloned, run, measures), {})
         return
     airl = run.configs(env, fields(run.method, "airl")).airl_of(trained[0])
     basis = {}
@@ -260,91 +288,83 @@ def _run(
             airl,
             requests.config.evaluation,
             chosen.candidates,
-            seed,
+            run.seed,
         )
-        yield from _choice(f"{name}.choice", choice)
+        yield from _choice(f"{run.name}.choice", choice)
         weight = chosen.weight(choice)
         if weight is not None:
             airl = msgspec.structs.replace(airl, penalty_weight=weight)
         basis = {"penalty choice": From(choice, "choice.json")}
-    learned = train_airl.request(From(demos), env, trained, airl, seed, basis)
-    yield Task(name, "rewards", learned)
-    learner = f"{train_airl.describe(learned.parameters.airl)} seed {seed}"
-    yield from _imitation(requests, learned, run, measures, {"reward-learning": learned})
+    learned = train_airl.request(From(demos), env, trained, airl, run.seed, basis)
+    yield Task(run.name, "rewards", learned)
+    reward = _Reward(requests, demos, learned, run, measures)
+    yield from _imitation(reward, {"reward-learning": learned})
     retrained: dict[str, list[Retrained]] = {}
-    for measure in RETRAINED:
-        if measure in measures:
-            for retraining in range(retrainings):
-                for place in trained if measure == "transfer-id" else unseen:
-                    moved = _retraining(requests, learned, seed, measure, place, retraining)
-                    where = str(place) if measure == "transfer-id" else ""
-                    cell = requests.cell(agent, measure, seed, where, retraining=retraining)
-                    yield from _retrained(requests, learned, moved, cell, place, name)
-                    member = Retrained(
-                        _known_as(measure, retraining),
-                        From(moved, "policy.pt"),
-                        moved.parameters.transfer.ceiling,
-                        measure == "from-student",
-                    )
-                    retrained.setdefault(str(place), []).append(member)
+    for measure in (measure for measure in RETRAINED if measure in measures):
+        for retraining in range(retrainings):
+            for place in trained if measure == "transfer-id" else requests.unseen:
+                moved = _retraining(reward, measure, place, retraining)
+                yield from _retrained(reward, moved, measure, place, retraining)
+                member = Retrained(
+                    _known_as(measure, retraining),
+                    From(moved, "policy.pt"),
+                    moved.parameters.transfer.ceiling,
+                    measure == "from-student",
+                )
+                retrained.setdefault(str(place), []).append(member)
     if "transfer" in measures:
-        cell = requests.cell(agent, EXPERT_BY_REWARD, seed, str(unseen[0]))
-        expert, label = requests.expert(unseen[0]), f"expert of {unseen[0]}"
-        request = requests.returns(
-            unseen,
-            expert,
-            reward=learned,
-            policy_label=label,
-            reward_label=learner,
-            ceiling=requests.config.transfer_of(unseen[0]).ceiling,
-        )
-        yield Task(f"{name}.expert-by-reward", "returns", request, cell)
+        yield _expert_by_reward(reward)
     if CUE in measures:
         request = measure_cue.request(
-            From(learned, "reward.pt"), From(demos), env, trained, learner
+            From(learned, "reward.pt"), From(demos), env, trained, reward.label
         )
-        yield Task(f"{name}.cue", "returns", request, requests.cell(agent, CUE, seed))
+        yield Task(f"{run.name}.cue", "returns", request, reward.cell(CUE))
     if ASSESS in measures:
-        yield from _assessment(requests, demos, learned, retrained, run, measures)
+        yield from _assessment(reward, retrained)
 
 
-def _imitation(
-    requests: _RowRequests,
-    learned: Request,
-    run: Run,
-    measures: Sequence[str],
-    curves: Mapping[str, Request],
-) -> Iterator[Task]:
+def _imitation(reward: _Reward, curves: Mapping[str, Request]) -> Iterator[Task]:
     """What the policy earns that was trained on the demonstrations: a student, or a clone."""
-    label = f"{learned.stage.name} {run.agent} of seed {run.seed}"
+    requests, run = reward.requests, reward.run
+    label = f"{reward.learned.stage.name} {run.agent} of seed {run.seed}"
     for measure, places in (("zero-shot", requests.unseen), ("id", requests.trained)):
-        if measure in measures:
-            cell = requests.cell(run.agent, measure, run.seed)
-            request = requests.returns(places, learned, policy_label=label)
-            yield Task(f"{run.name}.{measure}-returns", "returns", request, cell, curves)
+        if measure in reward.measures:
+            request = requests.returns(places, reward.learned, policy_label=label)
+            name = f"{run.name}.{measure}-returns"
+            yield Task(name, "returns", request, reward.cell(measure), curves)
 
 
-def _assessment(
-    requests: _RowRequests,
-    demos: Request,
-    learned: Request,
-    retrained: Mapping[str, Sequence[Retrained]],
-    run: Run,
-    measures: Sequence[str],
-) -> Iterator[Task]:
-    """The bank of a row's policies, and how well the reward of ``learned`` ranks them.
+def _expert_by_reward(reward: _Reward) -> Task:
+    """The learned return of the unseen setting's expert."""
+    requests = reward.requests
+    (place,) = requests.unseen
+    request = requests.returns(
+        [place],
+        requests.expert(place),
+        reward=reward.learned,
+        policy_label=f"expert of {place}",
+        reward_label=reward.label,
+        ceiling=requests.config.transfer_of(place).ceiling,
+    )
+    cell = reward.cell(EXPERT_BY_REWARD, str(place))
+    return Task(f"{reward.run.name}.expert-by-reward", "returns", request, cell)
+
+
+def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Retrained]]) -> Iterator[Task]:
+    """The bank of a row's policies, and how well the reward ranks them.
 
     It has the unseen setting only where another measure does.
     """
+    requests, run = reward.requests, reward.run
     row, trained, unseen = requests.row, requests.trained, requests.unseen
-    looked_at = not set(measures) <= {*IN_DISTRIBUTION, ASSESS, CUE}
+    looked_at = not set(reward.measures) <= {*IN_DISTRIBUTION, ASSESS, CUE}
     places = [*trained, *(unseen if looked_at else ())]
-    imitation = clone.request(From(demos), row.env, trained, requests.config)
+    imitation = clone.request(From(reward.demos), row.env, trained, requests.config)
     yield Task(f"{run.shared}.clone", "returns", imitation)
     experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}
     policies = Policies(
         clone=From(imitation, "policy.pt"),
-        student=From(learned, "policy.pt"),
+        student=From(reward.learned, "policy.pt"),
         reused={
             str(e): experts[str(e)]
             for e in trained
@@ -361,10 +381,8 @@ def _assessment(
         policy = re.sub(r"[ ,:]+", "-", entry.policy.replace(f"{row.knob}=", ""))
         place = entry.setting.partition("=")[2].replace(":", "_")
         yield Task(f"{owner}.bank.{policy}.{place}", "returns", recorded)
-    label = f"{train_airl.describe(learned.parameters.airl)} seed {run.seed}"
-    request = assess.request(From(learned, "reward.pt"), row.env, members, label)
-    cell = requests.cell(run.agent, ASSESS, run.seed)
-    yield Task(f"{run.name}.assess", "returns", request, cell)
+    request = assess.request(From(reward.learned, "reward.pt"), row.env, members, reward.label)
+    yield Task(f"{run.name}.assess", "returns", request, reward.cell(ASSESS))
 
 
 def _known_as(measure: str, retraining: int) -> str:
@@ -373,53 +391,43 @@ def _known_as(measure: str, retraining: int) -> str:
     return f"{name} {retraining + 1}" if retraining else name
 
 
-def _retraining(
-    requests: _RowRequests,
-    learned: Request,
-    seed: int,
-    measure: str,
-    place: Setting,
-    retraining: int,
-) -> Request:
-    """A policy trained on one reward in ``place``."""
+def _retraining(reward: _Reward, measure: str, place: Setting, retraining: int) -> Request:
+    """A policy trained on the reward in ``place``."""
     return transfer.request(
-        From(learned, "reward.pt"),
-        requests.row.env,
+        From(reward.learned, "reward.pt"),
+        reward.requests.row.env,
         place,
-        requests.config.transfer_of(place),
-        seed + retraining * _NEXT_RETRAINING,
-        f"{train_airl.describe(learned.parameters.airl)} seed {seed}",
-        From(learned, "policy.pt") if measure == "from-student" else None,
+        reward.requests.config.transfer_of(place),
+        reward.run.seed + retraining * _NEXT_RETRAINING,
+        reward.label,
+        From(reward.learned, "policy.pt") if measure == "from-student" else None,
     )
 
 
 def _retrained(
-    requests: _RowRequests,
-    learned: Request,
-    moved: Request,
-    cell: Cell,
-    place: Setting,
-    reward: str,
+    reward: _Reward, moved: Request, measure: str, place: Setting, retraining: int
 ) -> Iterator[Task]:
     """The policy of ``moved``, and what it earns in ``place``, by the reward too."""
-    name = f"{reward}.{cell.measure}"
-    name += f".{_value(place)}" if cell.place else ""
-    name += f".{cell.retraining}" if cell.retraining else ""
+    in_distribution = measure == "transfer-id"
+    cell = reward.cell(measure, str(place) if in_distribution else "", retraining=retraining)
+    name = f"{reward.run.name}.{measure}"
+    name += f".{_value(place)}" if in_distribution else ""
+    name += f".{retraining}" if retraining else ""
     yield Task(name, "transfers", moved)
     config = moved.parameters.transfer
     how = labels.retrained(
-        config.algorithm, config.ceiling, cell.measure == "from-student", config.restarts
+        config.algorithm, config.ceiling, measure == "from-student", config.restarts
     )
-    request = requests.returns(
+    request = reward.requests.returns(
         [place],
         moved,
-        reward=learned,
+        reward=reward.learned,
         policy_label=f"transfer {cell.agent} {how}".strip() + f" of seed {cell.seed}",
-        reward_label=f"{train_airl.describe(learned.parameters.airl)} seed {cell.seed}",
+        reward_label=reward.label,
         # Learned returns are compared for this measure only.
-        ceiling=config.ceiling if cell.measure == "transfer" else None,
+        ceiling=config.ceiling if measure == "transfer" else None,
     )
-    first = cell.measure == "transfer" and not cell.retraining
+    first = measure == "transfer" and not retraining
     curves = {"transfer-learning": moved} if first else {}
     yield Task(f"{name}-returns", "returns", request, cell, curves)
 

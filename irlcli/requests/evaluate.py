@@ -56,9 +56,9 @@ class _Reward(NamedTuple):
     @property
     def arguments(self) -> dict[str, Any]:
         """Keywords of ``evaluate.request``."""
-        from irlcli.stages.train_airl import describe
+        from irlcli.stages.train_airl import reward_label
 
-        label = f"{describe(self.origin.airl)} seed {self.origin.seed}"
+        label = reward_label(self.origin.airl, self.origin.seed)
         return {"reward": self.source, "reward_label": label}
 
 

@@ -9,7 +9,7 @@ from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import transfer as stage
 from irlcli.stages.base import Request
-from irlcli.stages.train_airl import describe
+from irlcli.stages.train_airl import reward_label
 
 _STARTS = ("scratch", "student")
 
@@ -57,7 +57,7 @@ def transfer(
             f"{options[0]} {given[options[0]]!r} names {len(settings)} settings: {names}",
             "transfer to one at a time",
         )
-    label = f"{describe(origin.airl)} seed {origin.seed}"
+    label = reward_label(origin.airl, origin.seed)
     return stage.request(
         source,
         origin.env,

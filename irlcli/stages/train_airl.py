@@ -124,6 +124,11 @@ def describe(airl: AIRLConfig) -> str:
     return labels.learned(msgspec.to_builtins(airl))
 
 
+def reward_label(airl: AIRLConfig, seed: int) -> str:
+    """A learned reward, for the labels of what is made with it."""
+    return f"{describe(airl)} seed {seed}"
+
+
 def _check_selection(airl: AIRLConfig, settings: Sequence[str]) -> None:
     if airl.select not in ("last", "episodes", *settings):
         raise UsageError(
