@@ -22,6 +22,8 @@ MEASURES: tuple[Measure, ...] = get_args(Measure)
 _NAME = r"[a-z][a-z0-9-]{0,30}"
 _DEFAULTS = "defaults"
 _LARGEST = 1e300
+# What every comparison lists, or a file's defaults.
+_COMPARING = ("rows", "methods", "seeds", "measures")
 # What a method has that learns no reward.
 _OF_A_POLICY: tuple[Measure, ...] = ("zero-shot", "id")
 
@@ -187,17 +189,22 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
             raise UsageError(
                 f"{name}.settings: {settings} is not a file", f"a path relative to {directory}"
             )
-    comparing = ("rows", "methods", "seeds", "measures")
     if kind != "comparison":
-        for field in (*comparing, "retrainings", "variants", "base", "penalty_weights"):
+        for field in (*_COMPARING, "retrainings", "variants", "base", "penalty_weights"):
             if field in value:
                 raise UsageError(f"{name}.{field}: kind {kind!r} has no {field}", f"omit {field}")
         return Table(name=name, title=title, kind=kind, settings=settings)
     filled = {**defaults, **value}
-    for field in comparing:
+    for field in _COMPARING:
         if field not in filled:
             raise UsageError(f"{name}.{field} is missing", f"fields: {', '.join(fields)}")
         _check_is_list(f"{name}.{field}", filled[field])
+    table = Table(name=name, title=title, kind=kind, settings=settings)
+    return msgspec.structs.replace(table, **_comparison(name, filled, directory))
+
+
+def _comparison(name: str, filled: Mapping[str, Any], directory: Path) -> dict[str, Any]:
+    """The fields of a table that compares methods or variants."""
     _check_list(f"{name}.measures", filled["measures"], MEASURES)
     rows = [_row(f"{name}.rows", text, directory, filled["measures"]) for text in filled["rows"]]
     _check_list(f"{name}.rows", rows)
@@ -217,35 +224,35 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
         raise UsageError(
             f"{name}.retrainings: {retrainings!r} is not a count", "a whole number from 1"
         )
-    variants: tuple[Variant, ...] = ()
-    if "variants" in filled:
-        variants = read_variants(f"{name}.variants", filled["variants"], filled.get("base"))
-        _check_single(f"{name}.methods", filled["methods"])
-        if "transfer-id" not in filled["measures"]:
-            raise UsageError(
-                f"{name}.measures: variants are compared by policies retrained in distribution",
-                "add transfer-id",
-            )
-        if "penalty_weights" in filled:
-            raise UsageError(
-                f"{name}.penalty_weights: a table of variants has one method",
-                f"omit it, and write airl.penalty_weight=VALUE in {name}.variants",
-            )
-    elif "base" in filled:
-        raise UsageError(f"{name}.base: {name} has no variants", "omit base")
-    return Table(
-        name=name,
-        title=title,
-        kind=kind,
-        rows=tuple(rows),
-        methods=tuple(filled["methods"]),
-        seeds=tuple(filled["seeds"]),
-        measures=tuple(filled["measures"]),
-        retrainings=retrainings,
-        variants=variants,
-        penalty_weights=_weights(f"{name}.penalty_weights", filled.get("penalty_weights", {})),
-        settings=settings,
-    )
+    return {
+        "rows": tuple(rows),
+        "methods": tuple(filled["methods"]),
+        "seeds": tuple(filled["seeds"]),
+        "measures": tuple(filled["measures"]),
+        "retrainings": retrainings,
+        "variants": _variants(name, filled),
+        "penalty_weights": _weights(f"{name}.penalty_weights", filled.get("penalty_weights", {})),
+    }
+
+
+def _variants(name: str, filled: Mapping[str, Any]) -> tuple[Variant, ...]:
+    if "variants" not in filled:
+        if "base" in filled:
+            raise UsageError(f"{name}.base: {name} has no variants", "omit base")
+        return ()
+    variants = read_variants(f"{name}.variants", filled["variants"], filled.get("base"))
+    _check_single(f"{name}.methods", filled["methods"])
+    if "transfer-id" not in filled["measures"]:
+        raise UsageError(
+            f"{name}.measures: variants are compared by policies retrained in distribution",
+            "add transfer-id",
+        )
+    if "penalty_weights" in filled:
+        raise UsageError(
+            f"{name}.penalty_weights: a table of variants has one method",
+            f"omit it, and write airl.penalty_weight=VALUE in {name}.variants",
+        )
+    return variants
 
 
 def _weights(field: str, value: Any) -> Mapping[str, float]:
