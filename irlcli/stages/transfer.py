@@ -1,6 +1,9 @@
 """A retrained policy: on a frozen reward, in one setting, at first random (Sec. 5.3) or the student."""
 
+from __future__ import annotations
+
 from contextlib import closing
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import replace
@@ -21,6 +24,11 @@ from irlcli.stages.base import (
     environment_key,
     run_training,
 )
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from irlcli.rl.policy import Policy
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,34 +85,24 @@ def run(job: Job) -> None:
     import numpy as np
 
     from irlcli.data.outputs import write_metrics, write_policy
-    from irlcli.data.tensors import load_policy_file, load_reward_file
+    from irlcli.data.tensors import load_reward_file
     from irlcli.learners.frozen import FrozenReward
     from irlcli.rl import algorithm
     from irlcli.rl.loop import LastRound, NoLearner, Training
-    from irlcli.rl.policy import Policy, require_observations
+    from irlcli.rl.policy import require_observations
     from irlcli.rl.restarts import Restarts
     from irlcli.rl.rollout import roll_out
     from irlcli.rl.worlds import action_space, make_worlds, observation_size
     from irlcli.seeds import derive
 
     p: Parameters = job.parameters
-    env, config, where = (
-        p.environment.name,
-        p.transfer.trained_by,
-        f"{p.environment.name} {p.setting}",
-    )
+    env, config = p.environment.name, p.transfer.trained_by
+    where = f"{env} {p.setting}"
     settings = [parse_setting(env, p.setting)]
     model, origin = load_reward_file(job.inputs["reward"])
     student = None
     if "start" in job.inputs:
-        student, about = load_policy_file(job.inputs["start"])
-        if about.agent != "student":
-            raise UsageError(
-                f"the policy to start from is of the agent {about.agent}, not a student",
-                "name the policy.pt beside the reward",
-            )
-        own = ("net_arch", "activation", "normalise_observations", "use_sde")
-        config = replace(config, **{name: getattr(about.network, name) for name in own})
+        student, config = _student(job.inputs["start"], config)
     with closing(make_worlds(env, settings, config.n_envs, job.workers)) as worlds:
         reward = FrozenReward(
             model,
@@ -161,6 +159,24 @@ def run(job: Job) -> None:
         restarts=tuple(training.scores) if isinstance(training, Restarts) else (),
     )
     write_metrics(job.output, rows)
+
+
+def _student(path: Path, config: Any) -> tuple[Policy, Any]:
+    """The policy to start from, and ``config`` with its network.
+
+    Raises:
+        UsageError: not a student.
+    """
+    from irlcli.data.tensors import load_policy_file
+
+    student, about = load_policy_file(path)
+    if about.agent != "student":
+        raise UsageError(
+            f"the policy to start from is of the agent {about.agent}, not a student",
+            "name the policy.pt beside the reward",
+        )
+    own = ("net_arch", "activation", "normalise_observations", "use_sde")
+    return student, replace(config, **{name: getattr(about.network, name) for name in own})
 
 
 STAGE = Stage("transfer", 3, run)
