@@ -87,7 +87,7 @@ def _usage(error: Any) -> UsageError:
         if {"--rows", "--seeds", "--methods"} & set(sys.argv):
             hint = f"write a list with commas and without spaces, as in --seeds 0,1; {hint}"
     missing = re.match("^Missing argument '(TABLE|REPORT)'", message)
-    if missing:
+    if missing and "--experiments" not in sys.argv:
         from irlcli.cli import complete
 
         known = complete.tables("") if missing[1] == "TABLE" else complete.reports("")

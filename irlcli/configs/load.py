@@ -279,7 +279,7 @@ def _with_none(tree: Mapping[str, Any], kind: Any) -> dict[str, Any]:
     found = dict(tree)
     for name, value in tree.items():
         field = InterventionConfig if kind == _INTERVENTIONS else kind.__annotations__.get(name)
-        if value == "none" and type(None) in get_args(field):
+        if value == "none" and type(None) in get_args(field) and _table(field) is None:
             found[name] = None
         elif isinstance(value, Mapping) and (inner := _table(field)):
             found[name] = _with_none(value, inner)

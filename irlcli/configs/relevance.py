@@ -127,7 +127,7 @@ def _network(airl: AIRLConfig) -> AIRLConfig:
 
 
 def _kept_rounds(airl: AIRLConfig) -> AIRLConfig:
-    """Refuses two ways at once to choose the rounds that are kept."""
+    """Refuse two rules for the rounds that are kept; reset what the rule in use does not read."""
     if airl.averaged_rounds in (UNSET, 1):
         airl = replace(airl, averaged_rounds=UNSET)
     elif airl.select != "last":

@@ -88,6 +88,9 @@ def from_bytes(data: bytes) -> Any:
         # The machine may be short of memory: that proves nothing about the file.
         raise
     except Exception as error:
+        if isinstance(error, RuntimeError) and "can't allocate memory" in str(error):
+            # As torch reports it.
+            raise MemoryError(_first_line(error)) from None
         # A crafted archive makes zipfile and torch raise almost anything.
         raise ValueError(_first_line(error)) from None
 

@@ -81,10 +81,9 @@ def _experts(
     experts: dict[str, ExpertConfig] = {}
     for row in plan.table.rows:
         config = plan.configs(row.env)
-        experts[row.env] = config.expert
         listed = config.interventions.get(row.knob)
-        if listed is not None and listed.expert is not None:
-            experts[f"{row.env} {row.knob}"] = listed.expert
+        own = None if listed is None else listed.expert
+        experts[f"{row.env} {row.knob}"] = config.expert if own is None else own
     parameters = report_experts.Parameters(
         command=command,
         steps={name: expert.total_steps for name, expert in experts.items()},

@@ -176,7 +176,7 @@ class _RowRequests:
 
 
 class _Reward(NamedTuple):
-    """A reward of a row, or a clone in its place, and what its tasks depend on.
+    """A reward of a row, or a clone in its place, and what its tasks depend on; ``label`` is a reward's.
 
     Attributes:
         requests: of its row, under its own configs.

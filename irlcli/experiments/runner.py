@@ -263,9 +263,9 @@ class Runner:
 
     def _checked(self, source: Source) -> Path:
         """The path of an input whose bytes have the digest that the key holds."""
-        # A foreign file was hashed when the run was planned, which may be hours ago.
-        foreign = source_of(Resolved(None, source.path)) if source.artefact is None else source
-        if foreign.sha256 != source.sha256:
+        foreign = source.artefact is None
+        # It was hashed when the run was planned, which may be hours ago.
+        if foreign and source_of(Resolved(None, source.path)).sha256 != source.sha256:
             raise IntegrityError(
                 f"{source.path} changed after this run was planned",
                 "run the same command again",

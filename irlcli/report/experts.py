@@ -40,7 +40,7 @@ def summarise(
     Args:
         cells: the wanted evaluations; rows are ``ENV KNOB``.
         runs: provenance by id; an evaluation's only input is its policy.
-        steps: an expert's budget, by environment, and by row where it has its own.
+        steps: an expert's budget, by row.
         summaries: the existing evaluations by (agent, environment, setting), each a
             :class:`irlcli.data.descriptions.Returns`.
     """
@@ -67,7 +67,7 @@ def summarise(
                 "episodes": _value(expert, "episodes"),
                 "idle_return": _value(idle, "mean_return"),
                 "random_return": _value(random, "mean_return"),
-                "steps": steps.get(cell.row, steps[env]),
+                "steps": steps[cell.row],
                 "seconds": trained[0].seconds if trained else None,
                 "resumed": trained[0].resumed if trained else None,
                 "commit": ", ".join(commits(trained)) if trained else None,
@@ -101,14 +101,13 @@ def text_table(found: pd.DataFrame) -> Table:
 
 
 def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
-    """Experts that do not reach their bar, and missing ones. ``bars``: by environment and by row, as the steps."""
+    """Experts that do not reach the bar of their row, and missing ones."""
     experts = [cell for cell in cells if cell.agent == "expert"]
     missing = [f"{cell.row.split()[0]} {cell.place}" for cell in experts if not cell.run]
     low = [
         f"{row.env} {row.setting} ({row.true_return:.0f} of {bar:.0f})"
         for row in found.itertuples()
-        if (bar := bars.get(f"{row.env} {row.knob}", bars.get(row.env))) is not None
-        and row.true_return < bar
+        if (bar := bars.get(f"{row.env} {row.knob}")) is not None and row.true_return < bar
     ]
     sentences = [f"Below their bar, so not yet experts: {', '.join(low)}."] if low else []
     if missing:

@@ -17,8 +17,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         command: the command line that produces this report; printed in it.
-        steps: the budget of an expert, by environment, and by ``ENV KNOB`` where a knob has its own.
-        bars: the least mean true return of an expert, likewise, where there is a bar.
+        steps: the budget of an expert, by row: ``ENV KNOB``.
+        bars: the least mean true return of an expert, by row that has a bar.
         cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``; each ``place`` is a setting.
         runs: provenance of the artefacts, by id.
     """

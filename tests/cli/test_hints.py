@@ -202,3 +202,20 @@ def test_a_lambda_for_all_methods_is_refused_where_the_table_lists_some(irl, tmp
     done = irl(*line, "--methods", "irm,l2")
     assert done.code == 2 and "l2" in done.err and "irm" not in done.err.splitlines()[0]
     assert irl(*line, "--methods", "irm").code == 0
+
+
+@pytest.mark.parametrize(
+    ("of_all", "of_the_knob", "below"), [("-1e4", "1e4", 2), ("1e4", '"none"', 0)]
+)
+def test_an_expert_is_compared_with_the_bar_of_its_knob(
+    irl, smoke_store, tmp_path, of_all, of_the_knob, below
+):
+    file = tmp_path / "bars.toml"
+    file.write_text(
+        f"[expert]\nbar = {of_all}\n"
+        '[interventions.engine-power]\nid = ["1x", "1.25x"]\nood = ["1.5x"]\n'
+        f"[interventions.engine-power.expert]\nbar = {of_the_knob}\n"
+    )
+    line = "collect-experts --env lunar-lander --intervention engine-power=1x,1.25x --settings"
+    done = irl(*line.split(), file, *SMOKE, "--store", smoke_store.path)
+    assert done.code == 0 and done.err.count("bar 10000") == below

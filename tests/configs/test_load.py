@@ -11,6 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from irlcli.configs import PROFILES, Config, load_config
+from irlcli.configs.relevance import relevant_airl
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
@@ -433,13 +434,18 @@ def test_challengers_learn_as_retrained_policies_do():
 
 
 def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
-    legs, mass = (parse_settings("ant", text)[0] for text in ("leg-length=2x", "mass=2x"))
+    legs, friction = (
+        parse_settings("ant", text)[0] for text in ("leg-length=2x", "friction=2:0.6:0.6")
+    )
     config = load_config("ant")
-    for setting in (legs, mass):
-        challenger = config.airl_of(setting).challenger
-        assert challenger.ppo == config.transfer_of(setting).ppo
-        others = msgspec.structs.replace(config.airl, challenger=challenger)
-        assert config.airl_of(setting) == others
+    for setting in (legs, friction):
+        assert config.airl_of(setting).challenger.ppo == config.transfer_of(setting).ppo
+    own = config.airl_of(legs).challenger
+    assert config.airl_of(legs) == msgspec.structs.replace(config.airl, challenger=own)
+    # One challenger for the whole training, and a mean that has as many rounds as it asks for.
+    airl = relevant_airl(config.airl_of(friction), discrete_actions=False)
+    rounds = airl.ppo.rounds(airl.total_steps)
+    assert airl.challenger.life == rounds and airl.averaged_rounds <= rounds
     assert config.airl_of(legs).challenger.ppo.use_sde
     own = load_config("ant", file=toml("[airl.challenger.ppo]\nuse_sde = false"))
     assert not own.airl_of(legs).challenger.ppo.use_sde and own.transfer_of(legs).ppo.use_sde
@@ -498,3 +504,5 @@ def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):
     assert load_config(LANDER).transfer_of(bounce).ceiling == 0.9
     assert load_config(LANDER, file=lifted).transfer_of(bounce).ceiling is None
     assert "airl.hidden" in refused(file=toml('[airl]\nhidden = "none"')).message
+    whole = toml('[interventions.bounce]\nid = ["0.1"]\ntransfer = "none"')
+    assert "'none'" in refused(file=whole).message

@@ -26,6 +26,19 @@ def test_checkpoints_of_another_stage_are_not_used():
     assert len(reasons) == 6 and all(reasons)
 
 
+def test_a_shortage_of_memory_does_not_discard_a_checkpoint(monkeypatch):
+    """Torch reports it as a RuntimeError."""
+
+    def load(*args, **kwargs):
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. can't allocate memory")
+
+    data, reasons = to_bytes({"round": 1}), []
+    monkeypatch.setattr(torch, "load", load)
+    with pytest.raises(MemoryError):
+        restore(data, {"round"}, reasons.append)
+    assert not reasons
+
+
 TRAINING = {"trainer": {}, "learner": {}, "selector": {}, "rounds_done": 0}
 
 

@@ -29,7 +29,7 @@ def returns(mean):
     )
 
 
-def summarised(cells=CELLS, steps=MappingProxyType({"lunar-lander": 1000})):
+def summarised(cells=CELLS, steps=MappingProxyType({ROW: 1000})):
     evaluated = {
         ("expert", "lunar-lander", "bounce=0.1"): returns(250.0),
         ("random", "lunar-lander", "bounce=0.1"): returns(-200.0),
@@ -42,6 +42,7 @@ def test_a_setting_has_its_experts_return_and_training():
     there = found.loc["bounce=0.1"]
     assert (there["true_return"], there["random_return"], there["seconds"]) == (250.0, -200.0, 90.0)
     assert (there["use"], there["stands"], there["commit"]) == ("trained in", "done", "c0ffee")
+    assert there["steps"] == 1000
     missing = found.loc["bounce=0.9"]
     assert missing["use"] == "held out" and pd.isna(missing["true_return"])
     table = experts.text_table(summarised())
@@ -50,17 +51,10 @@ def test_a_setting_has_its_experts_return_and_training():
 
 @pytest.mark.parametrize(("bar", "low"), [(200.0, 0), (260.0, 1)])
 def test_caveats_name_missing_experts_and_those_below_their_bar(bar, low):
-    found = experts.caveats(CELLS, summarised(), {"lunar-lander": bar})
+    found = experts.caveats(CELLS, summarised(), {ROW: bar, "lunar-lander friction": 999.0})
     assert found[-1] == "Missing: 1 of 2 experts: lunar-lander bounce=0.9."
     assert len(found) == 1 + low
     assert not low or "bounce=0.1 (250 of 260)" in found[0]
-
-
-def test_a_row_may_have_its_own_bar_and_budget():
-    found = summarised(steps={"lunar-lander": 1000, ROW: 3000})
-    assert list(found["steps"]) == [3000, 3000]
-    low = experts.caveats(CELLS, found, {"lunar-lander": 200.0, ROW: 260.0})[0]
-    assert "bounce=0.1 (250 of 260)" in low
 
 
 def test_an_intervention_may_hold_no_value_out(tmp_path):
