@@ -26,7 +26,7 @@ WRONG = [
         2,
         "two knobs, friction and engine-power",
     ),
-    ("report", 2, "kind"),
+    ("report", 2, "REPORT"),
     ("report returns", 2, "refs"),
     ("report table9 score", 2, "table9"),
     ("report figure2 --profile smoke", 3, "figure2"),
