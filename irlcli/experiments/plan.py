@@ -10,7 +10,7 @@ import msgspec
 
 from irlcli.configs import Config
 from irlcli.errors import UsageError, closest
-from irlcli.experiments import rows
+from irlcli.experiments import figures, rows
 from irlcli.experiments.rows import PHASES, Chosen, Run, Task
 from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
@@ -98,10 +98,10 @@ class Plan:
 
     def _all_tasks(self) -> Iterator[Task]:
         if self.table.kind == "figure2":
-            tasks, self.figure = rows.gridworld_figure(self._configs)
+            tasks, self.figure = figures.gridworld_figure(self._configs)
             yield from tasks
         elif self.table.kind == "control":
-            tasks, self.figure = rows.controls(self._configs)
+            tasks, self.figure = figures.controls(self._configs)
             yield from tasks
         for row in self.table.rows:
             if not self._may_hold(f"{row}."):

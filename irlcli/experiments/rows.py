@@ -23,7 +23,6 @@ from typing import Any, Literal, NamedTuple, get_args
 import msgspec
 
 from irlcli import labels
-from irlcli.configs.load import CONTROL
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.experiments.bank import Policies, Retrained, bank
@@ -39,9 +38,7 @@ from irlcli.stages import (
     choose_penalty,
     clone,
     collect_experts,
-    control,
     evaluate,
-    figure2,
     measure_cue,
     train_airl,
     train_expert,
@@ -458,35 +455,6 @@ def experts(row: Row, configs: Configs) -> Iterator[Task]:
             name, request = requests.own_returns(place)
             cell = requests.cell("expert", measure, place=str(place))
             yield Task(name, "returns", request, cell, {"learning": requests.expert(place)})
-
-
-def gridworld_figure(configs: Configs) -> tuple[list[Task], Request]:
-    """The datasets and the sweep of Figure 2, and the figure itself."""
-    env = "gridworld"
-    config = configs(env, None)
-    trained = parse_settings(env, f"path-group={','.join(config.interventions['path-group'].id)}")
-    unseen = [
-        setting
-        for knob, listed in config.interventions.items()
-        if listed.ood
-        for setting in parse_settings(env, f"{knob}={','.join(listed.ood)}")
-    ]
-    figure = figure2.request(env, trained, unseen, config)
-    sweep = made_by(figure.inputs["sweep"])
-    tasks = [
-        Task(f"figure2.demos.{demos.parameters.seed}", "demos", demos)
-        for demos in map(made_by, sweep.inputs.values())
-    ]
-    return [*tasks, Task("figure2.sweep", "rewards", sweep)], figure
-
-
-def controls(configs: Configs) -> tuple[list[Task], Request]:
-    """The parts of the positive controls, and their report."""
-    report = control.request(configs(CONTROL, None).control)
-    tasks = [
-        Task(f"control.{name}", "rewards", made_by(part)) for name, part in report.inputs.items()
-    ]
-    return tasks, report
 
 
 def made_by(source: Source | From) -> Request:

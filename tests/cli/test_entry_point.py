@@ -82,7 +82,9 @@ def test_the_shell_completes_values(words, offered):
 
 
 def test_completion_can_be_installed(tmp_path):
-    done = Done(["--show-completion", "bash"], env={**os.environ, "HOME": str(tmp_path)})
+    # Typer would ask which shell calls, and a service may call without one.
+    named = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1", "HOME": str(tmp_path)}
+    done = Done(["--show-completion", "bash"], env={**os.environ, **named})
     assert (done.code, done.err) == (0, "") and "_IRL_COMPLETE=complete_bash" in done.out
 
 
