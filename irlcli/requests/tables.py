@@ -2,10 +2,11 @@
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from irlcli.configs.load import read_toml
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
@@ -78,7 +79,6 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
         None if choice.seeds is None else arguments.seeds(",".join(_words(choice.seeds))),
         choice.row_names(),
     )
-    _check_weights(session, table)
     until = PHASES[-1] if choice.until is None else choice.until
     if until not in PHASES:
         raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
@@ -98,6 +98,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     session.table_file = table.settings
     selection = Selection(tag, candidates, until, choice.only)
     plan = Plan(table, selection, session.config, session.runner().lookup())
+    _check_weights(session, table)
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
@@ -106,13 +107,26 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
 def _check_weights(session: StageSession, table: "Table") -> None:
     """Refuse a lambda for all methods where the table lists one for some of them."""
     listed = [method for method in table.methods if method in table.penalty_weights]
-    changed = [o for o in session.overrides if o.partition("=")[0].strip() == _WEIGHT]
-    if listed and changed:
+    given = [f"--set {o}" for o in session.overrides if o.partition("=")[0].strip() == _WEIGHT]
+    if session.file is not None:
+        knobs = {row.knob for row in table.rows}
+        fields = _weights_in(read_toml(session.file), knobs)
+        given += [f"{field} in {session.file}" for field in fields]
+    if listed and given:
         raise UsageError(
-            f"--set {changed[-1]} does not apply to {', '.join(listed)}: {table.name} lists their "
-            "lambda",
+            f"{given[-1]} does not apply to {', '.join(listed)}: {table.name} lists their lambda",
             "omit them from --methods, or change the table with --experiments",
         )
+
+
+def _weights_in(tree: Mapping[str, Any], knobs: Set[str]) -> Iterator[str]:
+    """The fields of a valid settings file that set lambda, for all interventions or for one of ``knobs``."""
+    section, _, field = _WEIGHT.partition(".")
+    if field in tree.get(section, {}):
+        yield _WEIGHT
+    for knob, listed in tree.get("interventions", {}).items():
+        if knob in knobs and field in listed.get(section, {}):
+            yield f"interventions.{knob}.{_WEIGHT}"
 
 
 def _words(text: str) -> list[str]:

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import IntegrityError, StageFailed, UsageError
 from irlcli.store.digest import is_hexadecimal
 from irlcli.store.durable import write_durably
 from irlcli.store.manifest import read_json
@@ -124,14 +124,20 @@ def create(layout: Layout) -> None:
     """Create the directories and the format marker if they are missing.
 
     Raises:
-        OSError: the root is not writable.
+        StageFailed: the root cannot be written.
     """
     if layout.marker.exists():
         return
-    make_directories(layout)
-    # Created now: a user who may only read the store later cannot create it, but can lock it.
-    layout.gc_lock.touch()
-    write_durably(layout.marker, b'{"format": %d}\n' % FORMAT)
+    try:
+        make_directories(layout)
+        # Created now: a user who may only read the store later cannot create it, but can lock it.
+        layout.gc_lock.touch()
+        write_durably(layout.marker, b'{"format": %d}\n' % FORMAT)
+    except OSError as error:
+        raise StageFailed(
+            f"{layout.root} cannot become a store ({error.strerror or error})",
+            "name a directory that can be written, with --store or IRL_STORE",
+        ) from None
 
 
 def make_directories(layout: Layout) -> None:

@@ -250,6 +250,15 @@ def test_read_only_store(read_only, text, named):
     assert snapshot(read_only.path) == before
 
 
+def test_a_store_that_cannot_be_created(tmp_path):
+    parent = tmp_path / "read-only"
+    parent.mkdir(mode=0o555)
+    line = arguments(f"evaluate --idle {LANDER}", parent / "runs")
+    done = Done(line, preexec_fn=obey_permissions)
+    assert_answered(done, 1, str(parent / "runs"))
+    assert "--store" in done.err.splitlines()[-1]
+
+
 def test_read_only_store_can_be_read(read_only):
     for text in ("transfer --reward airl/reward.pt --ood 1.5x --name moved", "verify"):
         done = Done(arguments(text, read_only.path), preexec_fn=obey_permissions)

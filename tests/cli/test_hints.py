@@ -197,11 +197,29 @@ def test_a_missing_table_lists_the_tables(irl, command):
     assert {"table1", "figure2", "gates"} <= set(re.findall(r"\w+", done.err.splitlines()[-1]))
 
 
-def test_a_lambda_for_all_methods_is_refused_where_the_table_lists_some(irl, tmp_path):
-    line = ["plan", "control-airl", "--set", "airl.penalty_weight=30", "--store", tmp_path / "s"]
+@pytest.mark.parametrize(
+    "written",
+    [
+        None,
+        "[airl]\npenalty_weight = 30",
+        "[interventions.cue-strength.airl]\npenalty_weight = 30",
+    ],
+)
+def test_a_lambda_for_all_methods_is_refused_where_the_table_lists_some(irl, tmp_path, written):
+    (tmp_path / "own.toml").write_text(written or "")
+    given = (
+        ["--settings", tmp_path / "own.toml"] if written else ["--set", "airl.penalty_weight=30"]
+    )
+    line = ["plan", "control-airl", *given, "--rows", "lunar-lander", "--store", tmp_path / "s"]
     done = irl(*line, "--methods", "irm,l2")
     assert done.code == 2 and "l2" in done.err and "irm" not in done.err.splitlines()[0]
     assert irl(*line, "--methods", "irm").code == 0
+
+
+def test_a_lambda_of_an_intervention_that_is_no_row_is_not_refused(irl, tmp_path):
+    (tmp_path / "own.toml").write_text("[interventions.bounce.airl]\npenalty_weight = 30\n")
+    line = ["plan", "control-airl", "--settings", tmp_path / "own.toml", "--methods", "l2"]
+    assert irl(*line, "--rows", "lunar-lander", "--store", tmp_path / "s").code == 0
 
 
 @pytest.mark.parametrize(
