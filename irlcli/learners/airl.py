@@ -238,6 +238,39 @@ class AIRL:
             pools = [self._pool(data, None) for data, _ in challenged]
             sources.append(self._risks(pools, self._challenger_replay, expert, None))
         generator = torch.Generator().manual_seed(derive("discriminator", self._seed, index)[0])
+        losses = self._optimise(index, sources, weight, generator)
+        if config.replay_share > 0.0:
+            rng = np.random.default_rng(derive("replay", self._seed, index)[0])
+            for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
+                for setting, (data, numbers) in enumerate(found):
+                    replay.add(setting, data, numbers, rng)
+        if index in self._joins and self.network.members > 1:
+            self._members.append(deepcopy(self.model).requires_grad_(False))
+        self.scale = reward_scale(self.deployed, [*current, *expert])
+        optimised_cross_entropy, optimised_penalty = np.mean(losses, 0)
+        return [
+            diagnostics
+            | {
+                "optimised_cross_entropy": float(optimised_cross_entropy),
+                "optimised_penalty": float(optimised_penalty),
+                "penalty_weight": weight,
+            }
+            for diagnostics in self._diagnostics(current, expert, generator)
+        ]
+
+    def _optimise(
+        self,
+        index: int,
+        sources: Sequence[Sequence[Sequence[Stratum]]],
+        weight: float,
+        generator: torch.Generator,
+    ) -> list[tuple[float, float]]:
+        """Take round ``index``'s gradient steps. Returns the cross-entropy and penalty of each.
+
+        Raises:
+            StageFailed: the parameters stopped being finite.
+        """
+        config = self.config
         self._set_learning_rate(index)
         losses = []
         self.model.train()
@@ -261,24 +294,7 @@ class AIRL:
                 f"the discriminator's parameters are not finite after round {index}",
                 "a smaller airl.learning_rate or airl.penalty_weight usually helps",
             )
-        if config.replay_share > 0.0:
-            rng = np.random.default_rng(derive("replay", self._seed, index)[0])
-            for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
-                for setting, (data, numbers) in enumerate(found):
-                    replay.add(setting, data, numbers, rng)
-        if index in self._joins and self.network.members > 1:
-            self._members.append(deepcopy(self.model).requires_grad_(False))
-        self.scale = reward_scale(self.deployed, [*current, *expert])
-        optimised_cross_entropy, optimised_penalty = np.mean(losses, 0)
-        return [
-            diagnostics
-            | {
-                "optimised_cross_entropy": float(optimised_cross_entropy),
-                "optimised_penalty": float(optimised_penalty),
-                "penalty_weight": weight,
-            }
-            for diagnostics in self._diagnostics(current, expert, generator)
-        ]
+        return losses
 
     def _loss(
         self, batches: Sequence[Minibatch], weight: float, generator: torch.Generator

@@ -9,11 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Parameters
+from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, Parameters
 from irlcli.stages.base import Job, Request, Source, Stage
+from irlcli.store import read_json
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from irlcli.data.descriptions import AnyForm
+    from irlcli.report import caveats, compute
+    from irlcli.report.build import Report
 
 
 def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
@@ -21,8 +26,8 @@ def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
 
     The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. Outputs
     ``README.md``, ``KIND.csv`` (a row per cell), ``seeds.csv`` (a row per seed and setting),
-    ``comparisons.csv``, with variants ``variants.csv`` and ``shares.csv``, ``KIND.json``, ``.tex``, ``.html``, ``.png`` and ``.pdf``; for each row
-    with an assessed reward ``bank-ENV-KNOB.png``.
+    ``comparisons.csv``, with variants ``variants.csv`` and ``shares.csv``, ``KIND.json``, ``.tex``,
+    ``.html``, ``.png`` and ``.pdf``; for each row with an assessed reward ``bank-ENV-KNOB.png``.
     """
     return Request(STAGE, parameters, dict(sources), f"report {parameters.kind}")
 
@@ -32,30 +37,37 @@ def run(job: Job) -> None:
     import pandas as pd
 
     from irlcli.data import descriptions
-    from irlcli.data.outputs import write_csv, write_json
-    from irlcli.report import build, page, plots, scatter
-    from irlcli.store import read_json
+    from irlcli.report import build
 
     p: Parameters = job.parameters
-    points: list[dict[str, Any]] = []
-    assessments, pays = {}, {}
-    shared: set[tuple[str, str]] = set()
-    episodes: dict[tuple[str, str], dict[tuple[str, str], Any]] = {}
-    for cell in p.cells:
-        if not cell.run:
+    learning = {
+        role: _of_the_kept(pd.read_parquet(path))
+        for role, path in job.inputs.items()
+        if role.endswith("-learning")
+    }
+    rewards = {
+        (row.name, method, seed): learning[role]
+        for row in p.rows
+        for method in p.methods
+        for seed in p.seeds
+        if (role := f"{row.name} {method} {seed} reward-learning") in learning
+    }
+    assessments = _of_rewards(job, ASSESS, "assessment.json", descriptions.Assessment)
+    pays = _of_rewards(job, CUE, "cue.json", descriptions.CuePay)
+    points = pd.DataFrame(_points(job))
+    report = build.build(p, points, _episodes(job), rewards, assessments, pays)
+    _write(job, report, assessments, learning)
+
+
+def _points(job: Job) -> list[dict[str, Any]]:
+    """A row per evaluation and setting, see :mod:`irlcli.report.compute`."""
+    from irlcli.data import descriptions
+
+    points = []
+    for cell in _filled(job.parameters):
+        if cell.measure in (ASSESS, CUE):
             continue
-        directory = job.inputs[cell.role]
-        if cell.measure == ASSESS:
-            path = directory / "assessment.json"
-            assessed = descriptions.convert(read_json(path), descriptions.Assessment, path)
-            assessments[cell.row, cell.agent, cell.seed] = assessed
-            continue
-        if cell.measure == CUE:
-            path = directory / "cue.json"
-            pay = descriptions.convert(read_json(path), descriptions.CuePay, path)
-            pays[cell.row, cell.agent, cell.seed] = pay
-            continue
-        path = directory / "summary.json"
+        path = job.inputs[cell.role] / "summary.json"
         summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         scored = cell.measure in ("transfer", EXPERT_BY_REWARD)
         of_expert = cell.agent in ("expert", "reused") or cell.measure == EXPERT_BY_REWARD
@@ -76,29 +88,62 @@ def run(job: Job) -> None:
             }
             for place in summary.settings
         ]
-        if cell.seed is not None and cell.measure in p.measures:
-            returns = pd.read_parquet(directory / "episodes.parquet", columns=["true_return"])
-            group = episodes.setdefault((cell.row, cell.measure), {})
-            which = f"{cell.seed}"
-            which += f" in {cell.place}" if cell.place else ""
-            which += f" retraining {cell.retraining}" if cell.retraining else ""
-            # Variants share whole runs by design; only different runs can be suspiciously equal.
-            if not p.variants or (cell.row, cell.run) not in shared:
-                group[cell.agent, which] = returns["true_return"].to_numpy()
-            shared.add((cell.row, cell.run))
-    learning = {
-        role: _of_the_kept(pd.read_parquet(path))
-        for role, path in job.inputs.items()
-        if role.endswith("-learning")
-    }
-    rewards = {
-        (row.name, method, seed): learning[role]
-        for row in p.rows
-        for method in p.methods
-        for seed in p.seeds
-        if (role := f"{row.name} {method} {seed} reward-learning") in learning
-    }
-    report = build.build(p, pd.DataFrame(points), episodes, rewards, assessments, pays)
+    return points
+
+
+def _episodes(job: Job) -> caveats.Episodes:
+    """The true returns of what was learned, by (row, measure), then (agent, which)."""
+    import pandas as pd
+
+    p: Parameters = job.parameters
+    shared: set[tuple[str, str]] = set()
+    episodes: dict[tuple[str, str], dict[tuple[str, str], Any]] = {}
+    for cell in _filled(p):
+        if cell.seed is None or cell.measure not in p.measures:
+            continue
+        path = job.inputs[cell.role] / "episodes.parquet"
+        returns = pd.read_parquet(path, columns=["true_return"])
+        group = episodes.setdefault((cell.row, cell.measure), {})
+        which = f"{cell.seed}"
+        which += f" in {cell.place}" if cell.place else ""
+        which += f" retraining {cell.retraining}" if cell.retraining else ""
+        # Variants share whole runs by design; only different runs can be suspiciously equal.
+        if not p.variants or (cell.row, cell.run) not in shared:
+            group[cell.agent, which] = returns["true_return"].to_numpy()
+        shared.add((cell.row, cell.run))
+    return episodes
+
+
+def _of_rewards(
+    job: Job, measure: str, name: str, form: type[AnyForm]
+) -> dict[tuple[str, str, int | None], AnyForm]:
+    """What ``measure`` found of each reward, the file ``name``, by (row, method, seed)."""
+    from irlcli.data import descriptions
+
+    found = {}
+    for cell in _filled(job.parameters):
+        if cell.measure == measure:
+            path = job.inputs[cell.role] / name
+            found[cell.row, cell.agent, cell.seed] = descriptions.convert(
+                read_json(path), form, path
+            )
+    return found
+
+
+def _filled(p: Parameters) -> list[Cell]:
+    return [cell for cell in p.cells if cell.run]
+
+
+def _write(
+    job: Job,
+    report: Report,
+    assessments: compute.Assessments,
+    learning: Mapping[str, pd.DataFrame],
+) -> None:
+    from irlcli.data.outputs import write_csv, write_json
+    from irlcli.report import build, page, plots, scatter
+
+    p: Parameters = job.parameters
     write_csv(job.output / f"{p.kind}.csv", report.cells)
     write_csv(job.output / "seeds.csv", report.points)
     write_csv(job.output / "comparisons.csv", report.comparisons)
