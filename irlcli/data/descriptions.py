@@ -301,10 +301,14 @@ class HintPay(Struct, frozen=True, kw_only=True):
 
 
 class CuePay(Struct, frozen=True, kw_only=True):
-    """``cue.json``: what a learned reward pays for the cue alone."""
+    """``cue.json``: what a learned reward pays for the cue alone.
+
+    ``scale`` is the standard deviation of g on the training data.
+    """
 
     env: str
     reward: LearnedReward
+    scale: Positive
     settings: Annotated[tuple[HintPay, ...], Meta(min_length=1)]
 
 

@@ -22,7 +22,9 @@ _NOTE = (
     "What the frozen reward pays for each hint alone: g with the hint at 1 minus g with the hint at -1, "
     "everything else as recorded, mean over the demonstrated steps, in standard deviations of g on the "
     "training data; mean over the settings trained in, then over seeds with its 95 % bootstrap interval. "
-    f"The texture is right in {TEXTURE:.0%} of the steps of every setting, the cue in a share that differs."
+    f"The texture is right in {TEXTURE:.0%} of the steps of every setting, the cue in a share that differs. "
+    "sd of g: that deviation, mean over seeds (least to largest). If it is near zero, g hardly tells the "
+    "policy from the expert, and the other columns are noise."
 )
 
 
@@ -45,9 +47,9 @@ def hint_pay(
 
 
 def cue_pay(p: Parameters, pays: CuePays) -> pd.DataFrame:
-    """A row per row, method and seed: what its reward pays for ``cue`` and ``texture``.
+    """A row per row, method and seed: what its reward pays for ``cue`` and ``texture``, its ``scale``.
 
-    Means over the settings trained in.
+    Means over the settings trained in. The scale is the standard deviation of g.
     """
     found = [
         {
@@ -55,22 +57,29 @@ def cue_pay(p: Parameters, pays: CuePays) -> pd.DataFrame:
             "agent": method,
             "seed": seed,
             **{name: np.mean([getattr(s, name) for s in pay.settings]) for name in HINTS},
+            "scale": pay.scale,
         }
         for row in p.rows
         for method in p.methods
         for seed in p.seeds
         if (pay := pays.get((row.name, method, seed))) is not None
     ]
-    return pd.DataFrame(found, columns=["row", "agent", "seed", *HINTS])
+    return pd.DataFrame(found, columns=["row", "agent", "seed", *HINTS, "scale"])
 
 
 def cue_table(found: pd.DataFrame) -> Table:
     """A line per row and method."""
     lines = [
-        [row, title(method), str(len(seeds)), *(_interval(seeds[name]) for name in reversed(HINTS))]
+        [
+            row,
+            title(method),
+            str(len(seeds)),
+            *(_interval(seeds[name]) for name in reversed(HINTS)),
+            _range(seeds["scale"]),
+        ]
         for (row, method), seeds in found.groupby(["row", "agent"], sort=False)
     ]
-    columns = ["row", "method", "seeds", *reversed(HINTS)]
+    columns = ["row", "method", "seeds", *reversed(HINTS), "sd of g"]
     return Table("What the reward pays for the cue", _NOTE, columns, lines, heads=2)
 
 
@@ -79,3 +88,9 @@ def _interval(values: pd.Series) -> str:
     s = summarise(values.tolist())
     text = number(s.mean, 2)
     return text if s.interval is None else f"{text} [{s.interval[0]:.2f}, {s.interval[1]:.2f}]"
+
+
+def _range(values: pd.Series) -> str:
+    """The mean, and the least and the largest if there are several seeds."""
+    text = number(values.mean(), 2)
+    return text if len(values) == 1 else f"{text} ({values.min():.2f} to {values.max():.2f})"

@@ -71,8 +71,8 @@ def run(job: Job) -> None:
         facts = {text: " ".join(f"{name} {value:.2f}" for name, value in paid.items())}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)
-    pay = CuePay(env=p.environment.name, reward=reward, settings=tuple(found))
+    pay = CuePay(env=p.environment.name, reward=reward, scale=origin.scale, settings=tuple(found))
     write_json(job.output / "cue.json", msgspec.to_builtins(pay))
 
 
-STAGE = Stage("measure-cue", 1, run)
+STAGE = Stage("measure-cue", 2, run)

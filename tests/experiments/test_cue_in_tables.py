@@ -78,10 +78,13 @@ def test_the_report_tells_what_each_reward_pays_for_the_cue(made, tables, irl, t
     found = json.loads((tmp_path / "out" / "control.json").read_text())["cue_pay"]
     assert [(r["agent"], r["seed"]) for r in found] == [("erm", 0), ("irm", 0)]
     written = artefact(made, "irm.0.cue").directory / "cue.json"
-    settings = json.loads(written.read_text())["settings"]
+    measured = json.loads(written.read_text())
+    settings = measured["settings"]
     assert [s["setting"] for s in settings] == ["cue-strength=0.95", "cue-strength=0.8"]
     for name in ("cue", "texture"):
         assert found[1][name] == pytest.approx(sum(s[name] for s in settings) / 2)
+    described = json.loads((artefact(made, "irm.0").directory / "reward.json").read_text())
+    assert found[1]["scale"] == measured["scale"] == described["scale"] > 0.0
     assert "## What the reward pays for the cue" in (tmp_path / "out" / "README.md").read_text()
 
 
