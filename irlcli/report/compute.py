@@ -158,8 +158,8 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
 
     Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means; two-sided p-values
     ``p_welch`` (primary), ``p_welch_holm`` (over the rows), ``p_paired`` (over the ``pairs`` seeds
-    that both methods have) and ``p_student``; ``improvement``, the probability that a seed of x
-    beats one of y; ``not_imitated``, which of the two failed in distribution; ``why``, the reason
+    that both methods have), ``p_student`` and ``p_rank`` (Mann-Whitney); ``improvement``, the
+    probability that a seed of x beats one of y; ``not_imitated``, which of the two failed in distribution; ``why``, the reason
     for a missing Welch test.
     """
     pairs = [(v.name, p.variants[0].name) for v in p.variants[1:]] or comparisons(p.methods)
@@ -188,13 +188,14 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
                         "p_paired": paired_p(a[common].tolist(), b[common].tolist()),
                         "pairs": len(common),
                         "p_student": c.student,
+                        "p_rank": c.rank,
                         "improvement": c.improvement,
                         "not_imitated": " ".join(m for m in (x, y) if (row.name, m) in failed),
                         "why": c.why,
                     }
                 )
     columns = ["row", "measure", "x", "y", "difference", "p_welch", "p_welch_holm", "p_paired"]
-    columns += ["pairs", "p_student", "improvement", "not_imitated", "why"]
+    columns += ["pairs", "p_student", "p_rank", "improvement", "not_imitated", "why"]
     return pd.DataFrame(found, columns=columns)
 
 

@@ -170,3 +170,37 @@ def test_identical_runs_are_bitwise_equal():
     episodes = {0: [1.0, 2.0], 1: [1.0, 2.5], 2: [1.0, 2.0], 3: [1.0, 2.5 + 1e-15]}
     assert identical_runs(episodes) == [(0, 2)]
     assert identical_runs({0: [1.0]}) == []
+
+
+def counted(x, y):
+    """The share of all splits of the values whose ranks lie as far apart as those of x and y."""
+    values = np.array([*x, *y])
+    ranks = stats.rankdata(values)
+    sums = np.array(
+        [ranks[list(chosen)].sum() for chosen in combinations(range(len(values)), len(x))]
+    )
+    distance = abs(sums - len(x) * ranks.mean())
+    return (distance >= distance[0] - 1e-9).mean()
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        ([5.0, 6.0, 7.0, 8.0, 900.0], [0.0, 1.0, 2.0, 3.0, -900.0]),
+        ([1.0, 4.0, 2.5], [3.0, 0.0]),
+        ([1.0, 1.0, 2.0, 3.0], [1.0, 2.0, 2.0, 0.0]),
+        ([1.0, 1.0], [1.0, 1.0]),
+    ],
+)
+def test_the_rank_test_counts_splits(x, y):
+    assert compare(x, y).rank == pytest.approx(counted(x, y))
+
+
+def test_an_extreme_value_does_not_hide_an_order():
+    """Five against five without overlap: two splits of 252."""
+    found = compare([1.0, 2.0, 3.0, 4.0, 5.0], [-1.0, -2.0, -3.0, -4.0, -1e6])
+    assert found.rank == pytest.approx(2 / 252) and found.welch > 0.3
+
+
+def test_one_seed_has_no_rank_test():
+    assert compare([1.0], [2.0, 3.0]).rank is None
