@@ -16,7 +16,7 @@ from irlcli.cli.experiments import (
     TableFile,
 )
 from irlcli.cli.options import Name, stage_command
-from irlcli.cli.session import StageSession
+from irlcli.cli.session import DEFAULT_PROFILE, StageSession
 from irlcli.cli.tables import (
     check_out,
     copy_outputs,
@@ -84,7 +84,7 @@ def report(
         )
     match kind:
         case "returns":
-            _refuse(kind, options)
+            _refuse(kind, options | _of_stages(session))
             if not refs:
                 raise UsageError(
                     "refs are missing: no evaluation is named", "irl report returns REF..."
@@ -108,6 +108,18 @@ def _check_kind(chosen: Choice) -> None:
     if chosen.table not in tables:
         known = ["returns", "table2", *tables]
         raise UsageError(f"unknown report {chosen.table!r}", suggest(chosen.table, known))
+
+
+def _of_stages(session: StageSession) -> dict[str, Any]:
+    """The options of stages that were given, for a report that runs none."""
+    return {
+        "--profile": None if session.profile == DEFAULT_PROFILE else session.profile,
+        "--settings": session.file,
+        "--set": session.overrides or None,
+        "--dry-run": session.dry_run or None,
+        "--workers": None if session.workers == 1 else session.workers,
+        "--tensorboard": session.tensorboard,
+    }
 
 
 def _refuse(kind: str, options: Mapping[str, Any], *allowed: str) -> None:

@@ -1,5 +1,6 @@
 """The report on a table of ``settings/experiments.toml``: its request, its text, its files."""
 
+import os
 import shlex
 import shutil
 from pathlib import Path
@@ -51,8 +52,13 @@ def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> 
         for output in artefact.manifest.outputs:
             target = directory / output.path
             target.parent.mkdir(parents=True, exist_ok=True)
-            target.unlink(missing_ok=True)
-            shutil.copyfile(session.store.open(artefact, output.path), target)
+            # Whole or absent, also if this process is killed.
+            beside = target.with_name(f".{target.name}.{os.getpid()}")
+            try:
+                shutil.copyfile(session.store.open(artefact, output.path), beside)
+                beside.replace(target)
+            finally:
+                beside.unlink(missing_ok=True)
     except OSError as error:
         raise StageFailed(
             f"--out {directory} cannot be written: {error.strerror or error}",

@@ -64,15 +64,28 @@ class Steps:
         )
 
 
+def mixed_rewards() -> UsageError:
+    """Steps of sources with rewards beside steps of sources without."""
+    return UsageError(
+        "some sources have a true reward and others have none", "give all of them a reward, or none"
+    )
+
+
 def nowhere(_: int) -> str:
     """The place of steps that were checked already."""
     return "a step"
 
 
 def joined(pieces: Sequence[Steps]) -> Steps:
-    """The steps of all ``pieces``, one after the other."""
+    """The steps of all ``pieces``, one after the other.
+
+    Raises:
+        UsageError: some have rewards and others have none.
+    """
     if len(pieces) == 1:
         return pieces[0]
+    if len({piece.rewards is None for piece in pieces}) > 1:
+        raise mixed_rewards()
     columns = {
         name: np.concatenate([getattr(piece, name) for piece in pieces])
         for name in Steps.__dataclass_fields__

@@ -23,7 +23,7 @@ from irlcli.data.demonstrations import (
     steps_schema,
 )
 from irlcli.data.parquet import UNREADABLE, batches, write_table, writer
-from irlcli.data.steps import PIECE, Steps, pieces
+from irlcli.data.steps import PIECE, Steps, mixed_rewards, pieces
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import Setting
 
@@ -88,10 +88,7 @@ class _EpisodeTable:
     def add(self, schema: pa.Schema, steps: Steps) -> pa.Table:
         """The rows of ``steps.parquet`` for ``steps``, with ``schema``."""
         if (steps.rewards is not None) != self._rewarded:
-            raise UsageError(
-                "some sources have a true reward and others have none",
-                "give all of them a reward, or none",
-            )
+            raise mixed_rewards()
         rows = np.arange(len(steps))
         ends = np.flatnonzero(steps.terminated | steps.truncated)
         start = np.maximum.accumulate(np.where(steps.first, rows, -1))

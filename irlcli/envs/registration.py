@@ -129,8 +129,9 @@ def observed_of(spec: EnvironmentSpec) -> tuple[int | None, bool]:
     assert spec.own is not None
     world = Adapted(_own(spec, spec.own, {}, spec.name), spec.name)
     world.close()
-    _, _, name = spec.gym_id.rpartition(":")
-    steps = gymnasium.spec(name).max_episode_steps if name else None
+    # The id may lack a version, which Gymnasium then chooses.
+    made = world.unwrapped.spec
+    steps = None if made is None else gymnasium.spec(made.id).max_episode_steps
     return steps, not isinstance(world.action_space, gymnasium.spaces.Box)
 
 

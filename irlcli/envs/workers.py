@@ -104,8 +104,10 @@ def _work(
     The operating system closes that end when the parent ends for any reason, so no worker
     outlives its parent.
     """
-    # Ctrl-C reaches the whole foreground process group; the parent decides how to react.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C, `timeout` and schedulers signal the whole process group; the parent decides how to
+    # react, and a worker ends when its pipe does.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2):
+        signal.signal(number, signal.SIG_IGN)
     worlds: VectorWorlds | None = None
     actions, observations, rewards = (view[worker::workers] for view in shared.views())
     try:

@@ -26,19 +26,30 @@ class _Made(msgspec.Struct, frozen=True, kw_only=True):
 def introduce(artefact: Artefact) -> None:
     """Let the name of the environment that ``artefact`` was made in be known.
 
-    An environment that is known by this name already stays: the user named its file.
+    An environment that the user named by its file stays.
 
     Raises:
         IntegrityError: the artefact holds no description of it, or one that its key contradicts.
+        UsageError: an artefact before this one was made in another environment of this name.
     """
     try:
         made = msgspec.convert(artefact.manifest.record.parameters, _Made).environment
     except msgspec.ValidationError:
         # What needs the environment reports it.
         return
-    if made is None or made.own is None or registry.is_known(made.name):
+    if made is None or made.own is None:
         return
-    registry.introduce(_described(artefact, made, made.own))
+    if not registry.is_known(made.name):
+        registry.introduce(_described(artefact, made, made.own))
+        return
+    known = registry.environment(made.name)
+    from_artefact = known.own is not None and known.own.directory is None
+    if from_artefact and not _is_made_in(known, made, made.own):
+        assert known.own is not None
+        raise UsageError(
+            f"artefact {artefact.id} was made in another {made.name!r} than {known.own.source}",
+            "name artefacts of one and the same environment, or its file with --env",
+        )
 
 
 def described(request: Request) -> Any | None:
@@ -67,17 +78,23 @@ def _described(artefact: Artefact, made: EnvironmentKey, own: OwnKey) -> Environ
         raise IntegrityError(
             f"{error.message} (its description of the environment)", "name its file with --env"
         ) from None
-    knobs = {name: knob.argument for name, knob in spec.knobs.items()}
-    same = (
-        (spec.name, spec.max_episode_steps, spec.own and spec.own.id, spec.entry_point or None)
-        == (made.name, made.max_episode_steps, own.id, own.entry_point)
-        and spec.own is not None
-        and spec.own.arguments == own.arguments
-        and own.knobs.items() <= knobs.items()
-    )
-    if not same:
+    if not _is_made_in(spec, made, own):
         raise IntegrityError(
             f"{source}: its provenance describes another environment than its key",
             "name the environment's file with --env",
         )
     return spec
+
+
+def _is_made_in(spec: EnvironmentSpec, made: EnvironmentKey, own: OwnKey) -> bool:
+    """Whether ``spec`` is the environment that the key of an artefact holds."""
+    if spec.own is None:
+        return False
+    knobs = {name: knob.argument for name, knob in spec.knobs.items()}
+    return (
+        (spec.name, spec.max_episode_steps, spec.own.id, spec.entry_point or None)
+        == (made.name, made.max_episode_steps, own.id, own.entry_point)
+        and spec.own.arguments == own.arguments
+        and spec.own.code == Code(own.sha256, own.distribution, own.version)
+        and own.knobs.items() <= knobs.items()
+    )

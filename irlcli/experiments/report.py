@@ -188,7 +188,8 @@ def _rows(plan: Plan) -> list[Row]:
 
 def _chosen(plan: Plan, row: str) -> dict[str, float]:
     """Each lambda of the table's own, by method, and each chosen one, by ``METHOD SEED``."""
-    found = {m: w for m, w in plan.table.penalty_weights.items() if m in plan.table.methods}
+    listed = {} if plan.selection.candidates else plan.table.penalty_weights
+    found = {method: weight for method, weight in listed.items() if method in plan.table.methods}
     for method in plan.table.methods:
         for seed in plan.table.seeds:
             task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")

@@ -49,8 +49,7 @@ from irlcli.store import file_digest, read_json
 
 Phase = Literal["experts", "demos", "rewards", "transfers", "returns"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
-# A reward's first policy is retrained with the reward's own seed, the next ones with seeds that no
-# other reward uses.
+# A reward's first policy is retrained with the reward's own seed, the next ones with seeds this far apart.
 _NEXT_RETRAINING = 1000
 
 
@@ -434,7 +433,8 @@ def _choice(name: str, choice: Request) -> Iterator[Task]:
     for measured in map(made_by, choice.inputs.values()):
         learned = made_by(measured.inputs["policy"])
         left_out = measured.parameters.settings[0].partition("=")[2].replace(":", "_")
-        trial = f"{name}.{learned.parameters.airl.penalty_weight:g}.without-{left_out}"
+        weight = repr(learned.parameters.airl.penalty_weight).removesuffix(".0").replace("+", "")
+        trial = f"{name}.{weight}.without-{left_out}"
         yield Task(trial, "rewards", learned)
         yield Task(f"{trial}.returns", "rewards", measured)
     yield Task(name, "rewards", choice)

@@ -34,13 +34,16 @@ class Configs(TypedDict, total=False):
 
 def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
     """``method`` with errors that name arguments instead of options, and show no inner frames."""
-    known = {*inspect.signature(method).parameters, *Configs.__annotations__} - {"self", "configs"}
+    known = {*inspect.signature(method).parameters} - {"self"}
+    if "configs" in known:
+        known = {*known, *Configs.__annotations__} - {"configs"}
+    shown = method.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @functools.wraps(method)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         # ``**configs`` would take any name.
         for name in kwargs.keys() - known:
-            raise UsageError(f"{method.__name__} has no argument {name!r}", suggest(name, known))
+            raise UsageError(f"{shown} has no argument {name!r}", suggest(name, known))
         try:
             return method(*args, **kwargs)
         except IrlError as error:

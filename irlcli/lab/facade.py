@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Unpack
 
+from irlcli.envs import registry
 from irlcli.lab.arguments import (
     Configs,
     Overrides,
@@ -409,6 +410,8 @@ class Lab:
     def _at_work(
         self, configs: Configs, line: Sequence[str], read_only: bool = False
     ) -> Iterator[StageSession]:
+        # As a command does, each call takes an environment from the file or the artefact it names.
+        registry.forget()
         session = self._session(configs, line, read_only)
         with session.reading():
             yield session

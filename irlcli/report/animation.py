@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageOps
 
 from irlcli.envs import registration as envs
 from irlcli.envs.registry import environment
-from irlcli.errors import StageFailed
+from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import Setting
 from irlcli.rl.policy import Policy, require_observations
 from irlcli.trajectories import Trajectory
@@ -67,7 +67,8 @@ def film(
         rewards: the learned reward in each setting.
 
     Raises:
-        UsageError: a setting's observations differ from those the policy was trained on.
+        UsageError: a setting's observations differ from those the policy was trained on, or the
+            environment draws no pictures.
     """
     with ExitStack() as stack:
         worlds = [
@@ -76,7 +77,12 @@ def film(
         ]
         for world, setting in zip(worlds, settings, strict=True):
             require_observations(policy, world.observation_space, f"{env} {setting}")
-        rate = worlds[0].metadata["render_fps"]
+        if "rgb_array" not in worlds[0].metadata.get("render_modes", ()):
+            raise UsageError(
+                f"{env} draws no pictures",
+                'irl play needs an environment whose metadata list the render mode "rgb_array"',
+            )
+        rate = worlds[0].metadata.get("render_fps", _FRAMES_PER_SECOND)
         stride = max(1, round(rate / _FRAMES_PER_SECOND))
         limit = min(steps, environment(env).max_episode_steps)
         scores = [None] * len(worlds) if rewards is None else rewards

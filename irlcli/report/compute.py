@@ -54,6 +54,19 @@ def sample(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataF
     return by_seed[["true_return", "progress"]].mean()
 
 
+def whole_sample(
+    p: Parameters, points: pd.DataFrame, row: str, agent: str, measure: str
+) -> pd.DataFrame:
+    """:func:`sample` without the seeds that lack an evaluation.
+
+    A mean over some of the settings cannot be compared with one over all of them.
+    """
+    lacking = [
+        c.seed for c in p.cells if (c.row, c.agent, c.measure, c.run) == (row, agent, measure, "")
+    ]
+    return sample(points, row, agent, measure).drop(lacking, errors="ignore")
+
+
 def points_of(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
     """The points of one row, agent and measure."""
     of = (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
@@ -154,7 +167,7 @@ def _with_imitation(p: Parameters, table: pd.DataFrame) -> pd.DataFrame:
 
 
 def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) -> pd.DataFrame:
-    """A row per row, measure and pair of methods (x, y).
+    """A row per row, measure and pair of methods (x, y), over seeds with every evaluation.
 
     Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means; two-sided p-values
     ``p_welch`` (primary), ``p_welch_holm`` (over the rows), ``p_paired`` (over the ``pairs`` seeds
@@ -169,7 +182,10 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     for measure in p.measures:
         for x, y in pairs:
             samples = [
-                [sample(points, row.name, agent, measure)["true_return"] for agent in (x, y)]
+                [
+                    whole_sample(p, points, row.name, agent, measure)["true_return"]
+                    for agent in (x, y)
+                ]
                 for row in p.rows
             ]
             tested = [compare(a.tolist(), b.tolist()) for a, b in samples]

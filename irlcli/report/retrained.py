@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from irlcli.report.compute import points_of, sample
+from irlcli.report.compute import points_of, whole_sample
 from irlcli.report.parameters import Parameters
 from irlcli.report.statistics import paired_p, summarise
 
@@ -55,7 +55,7 @@ def against_zero_shot(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     for row in p.rows if {"from-student", "zero-shot"} <= set(p.measures) else ():
         for method in p.methods:
             before, after = (
-                sample(points, row.name, method, measure)["true_return"]
+                whole_sample(p, points, row.name, method, measure)["true_return"]
                 for measure in ("zero-shot", "from-student")
             )
             common = before.index.intersection(after.index)

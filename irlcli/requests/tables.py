@@ -90,7 +90,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
                 f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
             )
         candidates = arguments.weights(choice.choose_penalty)
-    tag = choice.tag or (table.name if table.settings else session.profile)
+    tag = choice.tag or _tag(table, session.profile)
     try:
         session.store.check_name(f"{tag}.{table.name}")
     except UsageError as error:
@@ -102,6 +102,13 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
+
+
+def _tag(table: "Table", profile: str) -> str:
+    """What all names begin with: a table with settings of its own shares none with the others."""
+    if table.settings is None:
+        return profile
+    return table.name if profile == "standard" else f"{table.name}-{profile}"
 
 
 def _check_weights(session: StageSession, table: "Table") -> None:

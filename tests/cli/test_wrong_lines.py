@@ -31,6 +31,9 @@ WRONG = [
     ("report table9 score", 2, "table9"),
     ("report figure2 --profile smoke", 3, "figure2"),
     ("report returns score --out x", 2, "--out"),
+    ("report returns score --set airl.penalty_weight=3", 2, "--set"),
+    ("report returns score --dry-run", 2, "--dry-run"),
+    ("report returns score --profile smoke", 2, "--profile"),
     # Environments and interventions
     (
         "collect-experts --env lunar-lander --intervention bounce=0.1 --intervention friction=0.2",

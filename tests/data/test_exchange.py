@@ -321,3 +321,37 @@ def test_a_trajectory_knows_all_of_its_rewards_or_none():
     assert np.isnan(make(np.full(2, np.nan)).episode_return)
     with pytest.raises(ValueError, match="not finite"):
         make(np.array([np.nan, 1.0]))
+
+
+@pytest.mark.parametrize("kind", [pa.float16(), pa.float32(), pa.float64()])
+def test_a_setting_is_a_number_of_any_width(tmp_path, kind):
+    rng = np.random.default_rng(0)
+    made = table([episode(rng, 3), episode(rng, 4)], [0.1, 0.5])
+    at = made.column_names.index("setting")
+    numbers = pa.array(np.asarray(made["setting"]).astype(kind.to_pandas_dtype()))
+    pq.write_table(made.set_column(at, "setting", numbers), tmp_path / "a.parquet")
+    demos, _, _ = imported(tmp_path / "a", tmp_path / "a.parquet")
+    assert [len(group) for group in demos.trajectories.values()] == [1, 1]
+
+
+def test_a_value_without_its_knob_is_refused_where_there_are_several_knobs():
+    two = Expected(
+        "ant", ("mass=2x", "leg-length=2x"), "setting", HORIZON, CONTINUOUS, Irregular(False)
+    )
+    assert two.index("leg-length=2.0x", "row 0") == 1
+    with pytest.raises(UsageError, match="'2x' is not one of mass=2x, leg-length=2x"):
+        two.index("2x", "row 0")
+    one = Expected("ant", ("mass=2x", "mass=3x"), "setting", HORIZON, CONTINUOUS, Irregular(False))
+    assert one.index("3x", "row 0") == 1
+
+
+@pytest.mark.parametrize("order", [("with", "without"), ("without", "with")])
+def test_sources_with_and_without_a_reward_do_not_mix(tmp_path, order):
+    rng = np.random.default_rng(0)
+    parts = []
+    for name in order:
+        made = table([episode(rng, 3, rewards=name == "with")], TEXTS[:1])
+        pq.write_table(made, tmp_path / f"{name}.parquet")
+        parts += read_transitions(tmp_path / f"{name}.parquet", expected(), 100)
+    with pytest.raises(UsageError, match="some sources have a true reward"):
+        list(pieces(parts, 100))

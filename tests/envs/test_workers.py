@@ -170,6 +170,18 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR2])
+def test_a_signal_to_the_whole_group_leaves_the_workers_to_the_parent(stop):
+    worlds = WorkerWorlds([Fragile] * 2, max_episode_steps=100, workers=2)
+    try:
+        worlds.reset([0, 0])
+        for process in worlds._processes:
+            os.kill(process.pid, stop)
+        worlds.step(np.zeros(2, dtype=np.int64))
+    finally:
+        worlds.close()
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_no_worker_outlives_its_parent(stop, tmp_path):
     here = Path(__file__).parent

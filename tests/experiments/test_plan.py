@@ -105,6 +105,22 @@ def test_lambda_is_chosen_by_a_step_for_every_candidate_and_setting(plan, tmp_pa
     assert f"{ROW}.irm.0.choice" in steps[f"{ROW}.irm.0"]["needs"]
 
 
+def test_every_candidate_has_a_name(plan, tmp_path):
+    close = "0.1234567,0.1234568,1000000,1e20"
+    steps = plan(tmp_path / "none", "--choose-penalty", close, "--until", "rewards")
+    for weight in ("0.1234567", "0.1234568", "1000000", "1e20"):
+        assert f"{ROW}.irm.0.choice.{weight}.without-1x" in steps
+
+
+def test_profiles_of_a_table_with_settings_of_its_own_share_no_name(irl, tmp_path):
+    named = []
+    for profile in ("smoke", "standard"):
+        done = irl("plan", "demo", "--profile", profile, "--store", tmp_path / "none", "--json")
+        named.append({step["name"] for step in json.loads(done.out)["steps"]})
+    assert len(named[0]) == len(named[1]) and not named[0] & named[1]
+    assert all(name.startswith("demo.") for name in named[1])
+
+
 def test_what_exists_is_a_hit_whoever_made_it(plan, smoke_store):
     """The chain of plain commands gives the artefacts that the table asks for."""
     steps = plan(smoke_store.path)

@@ -1,5 +1,6 @@
 """`irl report table1` and its kin, end to end through the command line, on small budgets."""
 
+import errno
 import json
 import re
 import shutil
@@ -320,6 +321,21 @@ def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path
     # Without asking for it, the fixed lambda's runs are what the table is made of.
     fixed = json.loads(report("table1", copy, *ROW, "--json").out)["report"]
     assert sum(p["agent"] == "irm" and p["measure"] == "zero-shot" for p in fixed["points"]) == 2
+
+
+def test_a_copied_report_is_whole_or_the_one_before(report, table_store, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert report("table1", table_store, *ROW, "--out", out).code == 0
+    before = {path: path.read_bytes() for path in out.iterdir()}
+
+    def half(source, target):
+        Path(target).write_bytes(Path(source).read_bytes()[:10])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", half)
+    done = report("table1", table_store, *ROW, "--out", out)
+    assert done.code == 1 and "No space left" in done.err
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_a_profile_without_runs_is_no_table(report, irl, table_store):

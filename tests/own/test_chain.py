@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -183,3 +184,48 @@ def test_provenance_that_contradicts_the_key_is_refused(bench, publish):
         published = publish(store, stage="evaluate", parameters=parameters)
         refused = bench.irl("report", "returns", published.artefact.id)
         assert refused.code == 4 and "--env" in refused.err, refused.err
+
+
+def test_a_lab_takes_the_environment_from_each_artefact(bench):
+    """Demonstrations of one cart, then of another: the first keep theirs, as on the command line."""
+    own = ("--env", "cart.toml", "--intervention", "mass=1x,2x", *SMOKE)
+    first = made(bench, "collect-experts", *own)
+    lab = irlcli.Lab("runs", profile="smoke")
+    assert lab.collect_experts("cart.toml", "mass=1x,2x").id == first
+    bench.edit(bench.toml, "max_episode_steps = 50", "max_episode_steps = 40")
+    second = lab.collect_experts("cart.toml", "mass=1x,2x")
+    reward = lab.train_airl(first)
+    assert status(bench, "train-airl", "--demos", first, "--method", "erm", *SMOKE) == "HIT"
+    made_in = [lab.artefact(ref).parameters["environment"] for ref in (second, reward)]
+    assert [environment["max_episode_steps"] for environment in made_in] == [40, 50]
+
+
+def test_artefacts_of_two_environments_of_one_name_are_not_combined(bench):
+    own = ("--env", "cart.toml", "--intervention", "mass=1x,2x", *SMOKE)
+    learned = []
+    for steps in (50, 40):
+        bench.edit(bench.toml, "max_episode_steps = 50", f"max_episode_steps = {steps}")
+        demos = made(bench, "collect-experts", *own)
+        learned.append(made(bench, "train-airl", "--demos", demos, "--method", "erm", *SMOKE))
+    mixed = bench.irl("evaluate", "--policy", learned[0], "--reward", learned[1], *SMOKE)
+    assert mixed.code == 2 and "another 'cart'" in mixed.err and learned[1] in mixed.err
+    alone = bench.irl("evaluate", "--policy", learned[0], "--reward", learned[0], *SMOKE)
+    assert alone.code == 0, alone.err
+
+
+def test_an_id_may_lack_its_version(bench):
+    bench.edit(bench.toml, "max_episode_steps = 50\n", "")
+    bench.edit(bench.module, '"Cart-v0", Cart', '"Cart-v0", Cart, max_episode_steps=7')
+    bench.edit(bench.toml, '"cart:Cart-v0"', '"cart:Cart"')
+    idle = made(bench, *IDLE, "--env", "cart.toml")
+    record = Store("runs").resolve(idle).artefact.manifest.record
+    assert record.parameters["environment"]["max_episode_steps"] == 7
+
+
+def test_an_environment_that_draws_nothing_is_not_played(bench):
+    own = ("--env", "cart.toml", "--intervention", "mass=1x", *SMOKE)
+    demos = made(bench, "collect-experts", *own)
+    learned = made(bench, "train-airl", "--demos", demos, "--method", "erm", *SMOKE)
+    played = bench.irl("play", learned, "--out", "cart.gif")
+    assert played.code == 2 and "draws no pictures" in played.err and "render" in played.err
+    assert not Path("cart.gif").exists()

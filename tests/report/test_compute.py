@@ -19,8 +19,8 @@ from report_examples import (
 from irlcli.configs import Config
 from irlcli.report.agents import comparisons
 from irlcli.report.build import build
-from irlcli.report.compute import imitates
-from irlcli.report.parameters import EXPERT_BY_REWARD
+from irlcli.report.compute import compare_methods, imitates
+from irlcli.report.parameters import EXPERT_BY_REWARD, Cell
 
 
 def test_cells_are_means_over_seeds():
@@ -173,3 +173,23 @@ def test_the_configs_of_the_rows_are_those_that_the_budgets_read():
     tree = msgspec.to_builtins(Config())
     for stage, values in CONFIG.items():
         assert set(values) <= set(tree[stage])
+
+
+def test_a_seed_without_all_evaluations_is_not_compared():
+    """Two equal methods in settings of about 100 and 300; ERM lacks the second in two seeds."""
+    cells, points = [], []
+    for agent, lacking in (("erm", {2, 3}), ("irm", set())):
+        for seed in range(4):
+            for place, value in (("bounce=0.1", 100.0), ("bounce=0.5", 300.0)):
+                run = "" if seed in lacking and place == "bounce=0.5" else f"{len(points):016x}"
+                cells.append(Cell(BOUNCE, agent, "transfer-id", seed, place=place, run=run))
+                if run:
+                    of = {"row": BOUNCE, "agent": agent, "measure": "transfer-id", "seed": seed}
+                    points.append(of | {"true_return": value + seed, "progress": None})
+    p, _ = example({}, measures=("transfer-id",), seeds=(0, 1, 2, 3))
+    p = msgspec.structs.replace(p, cells=tuple(cells))
+    columns = {"row": [], "agent": [], "imitated": [], "measure": []}
+    found = compare_methods(p, pd.DataFrame(points), pd.DataFrame(columns))
+    (one,) = found[found["row"] == BOUNCE].itertuples()
+    # Seeds 0 and 1 of ERM against all four of IRM: 200.5 and 201.5.
+    assert one.difference == pytest.approx(1.0) and one.pairs == 2

@@ -51,9 +51,9 @@ class Expected:
         text = str(name)
         if text in self.settings:
             return self.settings.index(text)
-        knobs = {parse_setting(self.env, setting).knobs for setting in self.settings}
-        only = [f"{knob}={text}" for (knob,) in knobs] if all(len(k) == 1 for k in knobs) else []
-        for written in (text, *only):
+        knobs = {knob for s in self.settings for knob in parse_setting(self.env, s).knobs}
+        of_the_only = [f"{knob}={text}" for knob in knobs] if len(knobs) == 1 else []
+        for written in (text, *of_the_only):
             try:
                 found = str(parse_setting(self.env, written))
             except UsageError:

@@ -123,9 +123,15 @@ def _settings(batch: pa.RecordBatch, expected: Expected, place: Place) -> np.nda
     codes = coded.indices.to_numpy()
     found = np.zeros(len(coded.dictionary), dtype=np.int64)
     for code in np.unique(codes).tolist():
-        name = coded.dictionary[code].as_py()
+        name = _text(coded.dictionary[code])
         found[code] = expected.index(name, place(int(np.argmax(codes == code))))
     return found[codes]
+
+
+def _text(name: pa.Scalar) -> str:
+    """0.1 for the number nearest to it of any width."""
+    narrow = {pa.float16(): np.float16, pa.float32(): np.float32}.get(name.type)
+    return str(name.as_py() if narrow is None else narrow(name.as_py()))
 
 
 def _check_settings(column: pa.Array, expected: Expected, place: Place) -> None:
