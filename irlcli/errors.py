@@ -84,6 +84,31 @@ def file_failure(error: OSError) -> StageFailed:
     return StageFailed(f"{error.strerror or error}{where}", RETRY)
 
 
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "bool": "true or false",
+    "null": "none",
+    "array": "a list",
+    "object": "a table",
+}
+
+
+def of_types(message: str) -> str:
+    """msgspec's message about a value of another type, in the words of a settings file."""
+    import re
+
+    found = re.match("Expected `([^`]+)`, got `([^`]+)`$", message)
+    if found is None:
+        return message
+    expected, got = (
+        " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
+        for kinds in found.groups()
+    )
+    return f"expected {expected}, found {got}"
+
+
 def closest(name: str, known: Iterable[str]) -> str | None:
     """The known name that is most similar to ``name``, or ``None`` if none is similar."""
     # Imported here because only mistakes need it, and every command imports this module.

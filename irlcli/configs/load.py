@@ -23,7 +23,7 @@ from irlcli.configs.schema import (
     TransferConfig,
 )
 from irlcli.envs.registry import environment
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import UsageError, of_types, suggest
 from irlcli.interventions import knob_of, overlap, parse_settings
 
 PROFILES = ("smoke", "standard", "paper")
@@ -36,7 +36,8 @@ _MANY = 1e6
 # A name besides those of the environments: settings/control.toml has the positive controls.
 CONTROL = "control"
 _INTERVENTIONS = dict[str, InterventionConfig]
-Layers = Sequence[tuple[str, Mapping[str, Any]]]
+Layer = tuple[str, Mapping[str, Any]]
+Layers = Sequence[Layer]
 
 
 def check_profile(profile: str) -> None:
@@ -61,7 +62,8 @@ def load_config(
     Args:
         env: environment whose file in ``settings/`` is read, or :data:`CONTROL`.
         profile: ``smoke``, ``standard`` or ``paper``.
-        file: a TOML file of the same form (without profiles), laid over the profile.
+        file: a TOML file of the same form, laid over the profile. Its own section for the
+            profile, ``[profiles.smoke]`` say, is laid over the rest of it.
         overrides: ``airl.penalty_weight=30``, each typed by its field.
         flags: dotted field to value; None is left out.
 
@@ -76,10 +78,9 @@ def load_config(
         tree = read_toml(Path(own))
     else:
         own, tree = known.source, known.settings
-    profiles = tree.pop("profiles", {})
-    layers = [(own, tree), (f"{own}, profile {profile}", profiles.get(profile, {}))]
+    layers = in_profile(own, tree, profile)
     if file is not None:
-        layers.append((str(file), read_toml(file)))
+        layers += in_profile(str(file), read_toml(file), profile)
     layers += [(f"--set {item!r}", _override(item)) for item in overrides]
     layers += [
         (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted.split("."), value))
@@ -87,6 +88,30 @@ def load_config(
         if value is not None
     ]
     return _stack(env, layers)
+
+
+def in_profile(source: str, tree: Mapping[str, Any], profile: str) -> list[Layer]:
+    """A document's values, and over them those of its section for ``profile``.
+
+    Raises:
+        UsageError: ``[profiles]`` is no table of tables, or names an unknown profile.
+    """
+    profiles = tree.get("profiles", {})
+    tables = {"profiles": profiles}
+    if isinstance(profiles, Mapping):
+        tables |= {f"profiles.{name}": part for name, part in profiles.items()}
+        if unknown := [name for name in profiles if name not in PROFILES]:
+            raise UsageError(
+                f"{source}: unknown profile {unknown[0]!r}", suggest(unknown[0], PROFILES)
+            )
+    for where, part in tables.items():
+        if not isinstance(part, Mapping):
+            raise UsageError(
+                f"{source}: {where}: expected a table, found {part!r}",
+                "write [profiles.smoke.airl], for example",
+            )
+    plain = {name: part for name, part in tree.items() if name != "profiles"}
+    return [(source, plain), (f"{source}, profile {profile}", profiles.get(profile, {}))]
 
 
 def _stack(env: str, layers: Layers) -> Config:
@@ -226,7 +251,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
         if field.startswith("interventions[...]"):
             knob = next(k for k, v in tree["interventions"].items() if not _is_listed(v))
             field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
-        raise UsageError(f"{field}: {message}", _field_hint(field)) from None
+        raise UsageError(f"{field}: {of_types(message)}", _field_hint(field)) from None
     check_registered(config)
     for knob, values in config.interventions.items():
         trained, unseen = (
@@ -345,7 +370,8 @@ def _typed(text: str, kind: Any, field: str) -> Any:
     except (msgspec.ValidationError, UnicodeEncodeError) as error:
         # Arguments may hold bytes that are no text.
         raise UsageError(
-            f"--set {field}={text}: {str(error).partition(' - at ')[0]}", _field_hint(field)
+            f"--set {field}={text}: {of_types(str(error).partition(' - at ')[0])}",
+            _field_hint(field),
         ) from None
 
 

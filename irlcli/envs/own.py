@@ -22,7 +22,7 @@ from irlcli.configs.schema import Config, Count
 from irlcli.envs.code import code_of
 from irlcli.envs.registry import BUILT_IN
 from irlcli.envs.spec import Code, EnvironmentSpec, Form, Knob, Own
-from irlcli.errors import NotFound, UsageError, suggest
+from irlcli.errors import NotFound, UsageError, of_types, suggest
 
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,39}"
 _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
@@ -267,7 +267,8 @@ def _converted(value: Any, form: Any, where: str) -> Any:
         if missing:
             raise UsageError(f"{where}.{missing[1]} is missing", f"write it in [{where}]") from None
         raise UsageError(
-            f"{where}{f'.{field}' if field else ''}: {message}", "see docs/own-environments.md"
+            f"{where}{f'.{field}' if field else ''}: {of_types(message)}",
+            "see docs/own-environments.md",
         ) from None
 
 

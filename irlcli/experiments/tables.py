@@ -105,6 +105,8 @@ def load_table(name: str, path: Path | None = None) -> Table:
         UsageError: no table has that name; or as :func:`load_tables`.
     """
     tables = load_tables(path)
+    if name == "table2":
+        raise UsageError("table2 has no steps", "`irl report table2` prints it from settings/")
     if name not in tables:
         raise UsageError(f"unknown table {name!r}", suggest(name, tables))
     table = tables[name]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from irlcli.configs.load import read_toml
+from irlcli.configs.load import in_profile, read_toml
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
@@ -117,8 +117,10 @@ def _check_weights(session: StageSession, table: "Table") -> None:
     given = [f"--set {o}" for o in session.overrides if o.partition("=")[0].strip() == _WEIGHT]
     if session.file is not None:
         knobs = {row.knob for row in table.rows}
-        fields = _weights_in(read_toml(session.file), knobs)
-        given += [f"{field} in {session.file}" for field in fields]
+        for source, values in in_profile(
+            str(session.file), read_toml(session.file), session.profile
+        ):
+            given += [f"{field} in {source}" for field in _weights_in(values, knobs)]
     if listed and given:
         raise UsageError(
             f"{given[-1]} does not apply to {', '.join(listed)}: {table.name} lists their lambda",

@@ -99,6 +99,16 @@ def test_defaults_file_profile_settings_flags_and_set(toml):
     assert (loaded.airl.penalty_weight, loaded.airl.grouping) == (7.0, "per-setting")
 
 
+def test_a_settings_file_has_profiles_too(toml):
+    mine = toml(
+        "[profiles.smoke.airl]\npenalty_weight = 3\n"
+        "[airl]\npenalty_weight = 5\ngrouping = 'per-setting'"
+    )
+    loaded = [load_config(LANDER, profile, mine).airl for profile in ("smoke", "standard")]
+    assert [airl.penalty_weight for airl in loaded] == [3.0, 5.0]
+    assert {airl.grouping for airl in loaded} == {"per-setting"}
+
+
 def test_the_later_set_wins():
     loaded = load_config(LANDER, overrides=["airl.penalty_weight=1", "airl.penalty_weight=2"])
     assert loaded.airl.penalty_weight == 2.0
@@ -280,7 +290,9 @@ def test_files_that_cannot_be_read(tmp_path):
         ("[arl]\ngrouping = 'per-setting'", "'arl'", "did you mean 'airl'"),
         ("[airl]\ngroupng = 'pooled'", "'airl.groupng'", "did you mean 'grouping'"),
         ("[airl.ppo]\nn_env = 3", "'airl.ppo.n_env'", "did you mean 'n_envs'"),
-        ("[profiles.smoke.airl]\ngrouping = 'per-setting'", "'profiles'", "known: "),
+        ("[profiles.smok.airl]\ngrouping = 'per-setting'", "profile 'smok'", "'smoke'"),
+        ("[profiles]\nsmoke = 3", "profiles.smoke: expected a table", "[profiles.smoke.airl]"),
+        ("profiles = 3", "profiles: expected a table", "[profiles.smoke.airl]"),
         ("airl = 3", "airl: expected a table, found 3", "[airl] with some of: learner"),
         ("airl = []", "airl: expected a table, found []", "[airl]"),
         ("[airl]\nppo = 1", "airl.ppo: expected a table", "[airl.ppo] with some of: n_envs"),
