@@ -99,6 +99,12 @@ def test_same_seed_same_bytes_other_seed_other_bytes():
     assert not same(a, c)
 
 
+def test_every_round_starts_other_episodes():
+    trainer = make_trainer()
+    first, second = (trainer.train_round(i, TrueReward())[0].observations[0] for i in range(2))
+    assert (first != second).any(-1).all()
+
+
 def test_a_resumed_trainer_equals_an_uninterrupted_one():
     through, first = make_trainer(), make_trainer()
     for index in range(3):
@@ -172,6 +178,14 @@ def test_noise_replaces_that_share_of_a_policys_actions(env, knob):
     assert shares[0] == 0.0
     assert shares[1] == pytest.approx(0.25, abs=0.08)
     assert shares[2] == pytest.approx(1.0, abs=0.12)
+
+
+def test_noise_reaches_a_policy_that_acts_without_the_cue():
+    """With nothing but noise, the four actions are equally likely."""
+    cue = parse_setting("lunar-lander", "cue-strength=0.8")
+    episodes = roll_out("lunar-lander", cue, make_trainer().policy, 4, 0, "test", True, noise=1.0)
+    actions = np.concatenate([t.actions for t in episodes])
+    assert np.bincount(actions) / len(actions) == pytest.approx(0.25, abs=0.08)
 
 
 def test_idle_episode_equals_gymnasiums():

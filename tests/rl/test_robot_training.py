@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from falling import Falling
 
 from irlcli.configs import PPOConfig, load_config
 from irlcli.data.tensors import from_bytes, to_bytes
@@ -170,6 +171,16 @@ def test_rewards_are_divided_by_the_deviation_of_their_discounted_sums():
     expected = np.clip(rewards / np.std(sums), -10, 10)
     plain = ~rollout.truncated
     np.testing.assert_allclose(paid[plain], expected[plain], rtol=1e-4)
+
+
+def test_a_discounted_sum_ends_with_a_fall():
+    """Five steps that each pay 1, again and again: the sums are 1, 1.9, 2.71, ..."""
+    worlds = VectorWorlds([Falling(), Falling()], 50)
+    trainer = make_trainer(worlds, gamma=0.9, normalise_rewards=True)
+    trainer.train_round(0, TrueReward())
+    sums = np.cumsum(0.9 ** np.arange(5))
+    paid = trainer.model.rollout_buffer.rewards
+    np.testing.assert_allclose(paid, 1.0 / np.std(sums), rtol=1e-4)
 
 
 def test_a_resumed_robot_equals_an_uninterrupted_one_and_evaluation_leaves_it_alone():

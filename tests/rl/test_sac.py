@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from falling import Falling
 
 from irlcli.configs import SACConfig
 from irlcli.data.tensors import from_bytes, to_bytes
+from irlcli.envs.vector import VectorWorlds
 from irlcli.errors import StageFailed
 from irlcli.interventions import parse_settings
 from irlcli.rl.policy import describe, load_policy
@@ -38,9 +40,10 @@ class Reward:
         return self._function(rollout)
 
 
-def make_trainer(seed=0, **changes):
+def make_trainer(seed=0, worlds=None, **changes):
     sac = SACConfig(**{**SAC, **changes})
-    return SACTrainer(make_worlds("reacher", SETTINGS, sac.n_envs), sac, 1000, seed, "test")
+    worlds = worlds or make_worlds("reacher", SETTINGS, sac.n_envs)
+    return SACTrainer(worlds, sac, 1000, seed, "test")
 
 
 def test_random_actions_come_first_and_have_the_uniform_density():
@@ -66,6 +69,20 @@ def test_the_replay_holds_each_transition_with_its_pay():
     np.testing.assert_array_equal(np.flatnonzero(replay.timeouts[:, 0]), [149])
     sample = replay.sample(500)
     assert float(sample.dones.max()) == 0.0
+
+
+def test_a_fall_is_not_bootstrapped():
+    trainer = make_trainer(worlds=VectorWorlds([Falling(), Falling()], 50), n_steps=20)
+    trainer.train_round(0, TrueReward())
+    replay = trainer.model.replay_buffer
+    valueless = replay.dones[:20, 0] * (1.0 - replay.timeouts[:20, 0])
+    np.testing.assert_array_equal(np.flatnonzero(valueless), [4, 9, 14, 19])
+
+
+def test_every_round_starts_other_episodes():
+    trainer = make_trainer()
+    first, second = (trainer.train_round(i, TrueReward())[0].observations[0] for i in range(2))
+    assert (first != second).any(-1).all()
 
 
 def test_sampled_rewards_are_in_units_of_the_deviation_of_their_discounted_sums():
