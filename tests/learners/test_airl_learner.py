@@ -1,5 +1,7 @@
 """The learner as a whole: groupings, diagnostics, cloning, resuming."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -60,17 +62,99 @@ def test_the_logged_objective_is_the_one_that_was_optimised(demos, monkeypatch):
     assert rows[0]["cross_entropy"] != rows[0]["optimised_cross_entropy"]
 
 
-def test_diagnostics_are_per_true_setting_for_every_grouping(demos):
-    for grouping in ("pooled", "balanced", "per-setting", "shuffled"):
-        penalty = "irmv1" if grouping in ("per-setting", "shuffled") else "none"
-        _, _, rows = updated(demos, grouping=grouping, penalty=penalty)
-        assert len(rows) == 2
-        names = {"cross_entropy", "accuracy", "mean_abs_logit", "penalty", "penalty_weight"}
-        assert all(
-            set(row) == names | {"optimised_cross_entropy", "optimised_penalty"} for row in rows
-        )
-        assert all(0 <= row["accuracy"] <= 1 for row in rows)
-        assert rows[0]["cross_entropy"] != rows[1]["cross_entropy"]
+def moved(rollout, value, worlds=slice(None)):
+    """``rollout`` with all observations of ``worlds`` at ``value``."""
+    states = {"observations": rollout.observations, "next_observations": rollout.next_observations}
+    states = {name: array.copy() for name, array in states.items()}
+    for array in states.values():
+        array[:, worlds] = value
+    return dataclasses.replace(rollout, **states)
+
+
+@pytest.mark.parametrize("grouping", ["pooled", "balanced", "per-setting", "shuffled"])
+def test_diagnostics_are_per_true_setting_for_every_grouping(demos, grouping):
+    """The policy is told from the expert where its observations are unlike all others."""
+    penalty = "irmv1" if grouping in ("per-setting", "shuffled") else "none"
+    changes = {"updates_per_round": 60, "learning_rate": 1e-2, "batch_size": 128}
+    trainer, learner = make(
+        demos, ppo=LONG, horizon=HORIZON, grouping=grouping, penalty=penalty, **changes
+    )
+    rollouts = [moved(r, 5.0, slice(4, 8)) for r in trainer.train_round(0, learner)]
+    rows = learner.update(0, rollouts, trainer.policy)
+    names = {"cross_entropy", "accuracy", "mean_abs_logit", "penalty", "penalty_weight"}
+    optimised = {"optimised_cross_entropy", "optimised_penalty"}
+    assert [set(row) for row in rows] == 2 * [names | optimised]
+    assert rows[0]["accuracy"] < 0.95 < rows[1]["accuracy"]
+    assert rows[0]["cross_entropy"] > rows[1]["cross_entropy"]
+
+
+def test_diagnostics_measure_the_logits(demos, monkeypatch):
+    """The policy's are all -2; every other one of the expert's is 2, the rest -2."""
+    original = airl.discriminator_logits
+
+    def replaced(model, batch, form):
+        _, f = original(model, batch, form)
+        logits = torch.full_like(f, -2.0)
+        logits[:, 1, ::2] = 2.0
+        return 0.0 * f + logits, f
+
+    monkeypatch.setattr(airl, "discriminator_logits", replaced)
+    _, _, rows = updated(demos)
+    right, wrong = np.log1p(np.exp([-2.0, 2.0]))
+    for row in rows:
+        assert (row["accuracy"], row["mean_abs_logit"]) == (0.75, 2.0)
+        assert row["cross_entropy"] == pytest.approx(0.75 * right + 0.25 * wrong)
+
+
+def observed(demos):
+    """All observations of ``demos`` and of the round that a learner of them was updated on."""
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, fixed_horizon=False)
+    rollouts = [moved(r, 5.0) for r in trainer.train_round(0, learner)]
+    learner.update(0, rollouts, trainer.policy)
+    generated = [data for data, _ in learner._generated(rollouts)]
+    return learner, join([*generated, *[d for own in learner._demonstrations for d in own]])
+
+
+def test_observations_are_normalised_by_demonstrations_and_rollouts(demos):
+    learner, data = observed(demos)
+    seen = data.observations.astype(float)
+    np.testing.assert_allclose(learner.model.normaliser.mean, seen.mean(0), rtol=1e-6)
+
+
+def test_the_scale_is_the_deviation_of_g_over_demonstrations_and_rollouts(demos):
+    learner, data = observed(demos)
+    with torch.no_grad():
+        actions = learner.model.encode(torch.as_tensor(data.actions))
+        g = learner.model.reward(torch.as_tensor(data.observations), actions)
+    assert learner.scale == pytest.approx(float(g.double().std()), rel=1e-4)
+
+
+def test_every_round_draws_other_samples(demos, monkeypatch):
+    drawn = []
+    original = airl.discriminator_logits
+
+    def spy(model, batch, form):
+        drawn.append(batch.observations)
+        return original(model, batch, form)
+
+    monkeypatch.setattr(airl, "discriminator_logits", spy)
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, updates_per_round=1, replay_share=0.0)
+    rollouts = trainer.train_round(0, learner)
+    for index in range(2):
+        learner.update(index, rollouts, trainer.policy)
+    # Of each round a minibatch and the samples of its diagnostics.
+    first, _, second, _ = drawn
+    assert first.shape == second.shape and not torch.equal(first, second)
+
+
+def test_a_step_is_as_long_as_the_clipped_gradient_allows(demos):
+    """The gradient is so short that Adam divides it by its epsilon, 1e-8."""
+    clipped = {"max_grad_norm": 1e-12, "weight_decay": 0.0, "learning_rate": 0.1}
+    trainer, learner = make(demos, **clipped)
+    before = [p.detach().clone() for p in learner.model.parameters()]
+    learner.update(0, trainer.train_round(0, learner), trainer.policy)
+    for now, then in zip(learner.model.parameters(), before, strict=True):
+        assert torch.allclose(now, then, rtol=0.0, atol=1e-3)
 
 
 def test_erm_measures_the_penalty_that_it_does_not_optimise(demos):
@@ -90,6 +174,15 @@ def test_shuffled_labels_learn_another_reward(demos):
     plain = updated(demos, **IRM)[1]
     shuffled = updated(demos, **{**IRM, "grouping": "shuffled"})[1]
     assert to_bytes(plain.snapshot()) != to_bytes(shuffled.snapshot())
+
+
+def test_another_seed_deals_otherwise(demos):
+    dealt = set()
+    for seed in range(5):
+        _, learner = make(demos, grouping="shuffled", seed=seed)
+        parts = [part for group in learner._groups for part in group.parts]
+        dealt.add(str([(e, sorted(own)) for p in parts for e, own in p.episodes.items()]))
+    assert len(dealt) > 1
 
 
 def test_every_grouping_draws_as_many_samples(demos, monkeypatch):
@@ -126,6 +219,21 @@ def test_the_policys_samples_are_shared_out_as_the_demonstrations_are(demos):
     assert (first.count, second.count) == (32, 96)
     for setting, stratum in enumerate((first, second)):
         assert torch.equal(stratum.policy.observations, pools[setting].observations)
+
+
+@pytest.mark.parametrize(("pairing", "met"), [("matched", [{0}, {1}]), ("pooled", 2 * [{0, 1}])])
+def test_a_risk_meets_the_policys_samples_of_its_own_setting_or_of_all(demos, pairing, met):
+    """The policy of setting 0 is always at 0, that of setting 1 at 1, also in the replay."""
+    trainer, learner = make(
+        demos, ppo=LONG, horizon=HORIZON, grouping="per-setting", pairing=pairing
+    )
+    rollouts = trainer.train_round(0, learner)
+    rollouts = [moved(moved(r, 0.0, slice(0, 4)), 1.0, slice(4, 8)) for r in rollouts]
+    learner.update(0, rollouts, trainer.policy)
+    pools = [learner._pool(data, None) for data, _ in learner._generated(rollouts)]
+    risks = learner._risks(pools, learner._replay, pools, None)
+    for which in (lambda stratum: stratum.policy, lambda stratum: stratum.past[0]):
+        assert [set(which(s).observations.unique().tolist()) for (s,) in risks] == met
 
 
 def test_a_student_begins_as_a_clone_of_all_experts(demos):

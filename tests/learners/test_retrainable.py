@@ -17,6 +17,7 @@ from irlcli.learners import airl, discriminator
 from irlcli.learners.pools import Minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions
+from irlcli.penalties.risk import cross_entropy
 from irlcli.rl.challengers import Challengers
 
 LONG = PPOConfig(n_envs=8, n_steps=220, batch_size=512, n_epochs=1)
@@ -235,8 +236,23 @@ def test_past_challengers_are_replayed_beside_the_present_one(demos, monkeypatch
         assert not (past.observations == 5.0).all(-1).any()
 
 
-def test_challengers_are_negatives(demos):
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_the_share_of_challengers_is_taken_from_the_student(demos, share):
     """With the whole weight on challengers, the student's own samples teach g nothing."""
+    challenger = replace(CHALLENGED["challenger"], share=share)
+    _, learner, _ = challenged(demos, grouping="per-setting", challenger=challenger)
+    student, challengers = (a_batch(size, observations=8, actions=4) for size in (6, 10))
+    total = learner._loss([student, challengers], 0.0, torch.Generator()).total
+    # Both settings weigh the same.
+    own, other = (
+        cross_entropy(discriminator.discriminator_logits(learner.model, batch, "f")[0]).mean()
+        for batch in (student, challengers)
+    )
+    torch.testing.assert_close(total, (1.0 - share) * own + share * other)
+
+
+def test_challengers_are_negatives(demos):
+    """g falls where they are, and hardly where only the student's samples count."""
     lowered = {}
     for share in (0.0, 1.0):
         changes = {"challenger": replace(CHALLENGED["challenger"], share=share)}
