@@ -39,9 +39,9 @@ def maxent(settings, features, risks, penalty_weight=0.0, l2=0.0, seed=0, **chan
     )
 
 
-def risk(settings, risks, k, phi, horizon=16):
+def risk(settings, risks, k, phi, horizon=16, discount=1.0):
     """L_k: the mean negative log-likelihood of a risk's demonstrations, by its definition."""
-    partition = solve(settings, phi[None], horizon).log_partition[0]
+    partition = solve(settings, phi[None], horizon, discount).log_partition[0]
     return sum(
         risks.shares[k, e] * (partition[e] - risks.occupancy[k, e] @ phi)
         for e in range(len(partition))
@@ -197,6 +197,46 @@ def test_irmv1_full_is_differentiated_through_the_policy(grouping):
     step = 1e-5 * np.eye(25)
     numeric = [(objective(phi + d) - objective(phi - d)) / 2e-5 for d in step]
     assert np.allclose(learner.networks.psi.grad[0, :, 0], numeric, rtol=1e-4, atol=1e-4)
+
+
+def test_a_step_follows_the_gradient_of_the_discounted_risk():
+    """By finite differences in phi, the demonstrations' visits discounted alike."""
+    settings = mazes()
+    demos = expert_demonstrations(settings, COUNTS)
+    risks = group_risks(settings, demos, "pooled", 16, seed=0, discount=0.9)
+    learner = maxent(settings, np.eye(25), risks, hidden=0, discount=0.9)
+    phi = np.random.default_rng(0).normal(size=25)
+    with torch.no_grad():
+        learner.networks.psi[0, :, 0] = torch.as_tensor(phi)
+    learner.step(record=False)
+    numeric = [
+        (
+            risk(settings, risks, 0, phi + d, discount=0.9)
+            - risk(settings, risks, 0, phi - d, discount=0.9)
+        )
+        / 2e-5
+        for d in 1e-5 * np.eye(25)
+    ]
+    assert np.allclose(learner.networks.psi.grad[0, :, 0], numeric, atol=1e-6)
+
+
+@pytest.mark.parametrize(("warmup", "divisor"), [(0, 1.0), (2, 50.0)])
+def test_l2_adds_a_multiple_of_the_weights_to_the_gradient(warmup, divisor):
+    """After a warm-up it is divided by lambda = 50, as the rest of the objective is."""
+    settings = mazes()
+    risks = own_risks(soft_experts(settings, 1, 16))
+    plain, decayed = (
+        maxent(settings, np.eye(25), risks, 50.0, l2, hidden=0, penalty_warmup=warmup)
+        for l2 in (0.0, 0.3)
+    )
+    for _ in range(warmup):
+        plain.step(record=False)
+    decayed.networks.load_state_dict(plain.networks.state_dict())
+    decayed.iterations = plain.iterations
+    psi = plain.networks.psi.detach().clone()
+    plain.step(record=False), decayed.step(record=False)
+    added = decayed.networks.psi.grad - plain.networks.psi.grad
+    assert torch.allclose(added, 0.3 * psi / divisor, rtol=1e-9, atol=1e-12)
 
 
 def test_a_penalty_sees_the_risks_and_their_response_to_the_scale(monkeypatch):
