@@ -1,5 +1,7 @@
 """Small AIRL runs that several tests share."""
 
+import dataclasses
+
 from msgspec.structs import replace
 
 from irlcli.configs import AIRLConfig, PPOConfig
@@ -50,3 +52,12 @@ def make(
         seed=seed,
     )
     return trainer, learner
+
+
+def moved(rollout, value, worlds=slice(None)):
+    """``rollout`` with all observations of ``worlds`` at ``value``."""
+    states = {"observations": rollout.observations, "next_observations": rollout.next_observations}
+    states = {name: array.copy() for name, array in states.items()}
+    for array in states.values():
+        array[:, worlds] = value
+    return dataclasses.replace(rollout, **states)

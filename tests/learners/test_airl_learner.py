@@ -1,11 +1,9 @@
 """The learner as a whole: groupings, diagnostics, cloning, resuming."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, make, random_episodes
+from airl_runs import CONFIG, make, moved, random_episodes
 from msgspec.structs import replace
 
 from irlcli.configs import ChallengerConfig, PPOConfig
@@ -60,15 +58,6 @@ def test_the_logged_objective_is_the_one_that_was_optimised(demos, monkeypatch):
         assert float(loss.total) == pytest.approx(float(total), rel=1e-5)
     # Replay makes them differ from the diagnostics, which are of the current policy alone.
     assert rows[0]["cross_entropy"] != rows[0]["optimised_cross_entropy"]
-
-
-def moved(rollout, value, worlds=slice(None)):
-    """``rollout`` with all observations of ``worlds`` at ``value``."""
-    states = {"observations": rollout.observations, "next_observations": rollout.next_observations}
-    states = {name: array.copy() for name, array in states.items()}
-    for array in states.values():
-        array[:, worlds] = value
-    return dataclasses.replace(rollout, **states)
 
 
 @pytest.mark.parametrize("grouping", ["pooled", "balanced", "per-setting", "shuffled"])

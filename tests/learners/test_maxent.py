@@ -229,12 +229,12 @@ def test_l2_adds_a_multiple_of_the_weights_to_the_gradient(warmup, divisor):
         maxent(settings, np.eye(25), risks, 50.0, l2, hidden=0, penalty_warmup=warmup)
         for l2 in (0.0, 0.3)
     )
-    for _ in range(warmup):
-        plain.step(record=False)
-    decayed.networks.load_state_dict(plain.networks.state_dict())
-    decayed.iterations = plain.iterations
-    psi = plain.networks.psi.detach().clone()
-    plain.step(record=False), decayed.step(record=False)
+    psi = torch.as_tensor(np.random.default_rng(0).normal(size=(1, 25, 1)))
+    for learner in (plain, decayed):
+        with torch.no_grad():
+            learner.networks.psi[:] = psi
+        learner.iterations = warmup
+        learner.step(record=False)
     added = decayed.networks.psi.grad - plain.networks.psi.grad
     assert torch.allclose(added, 0.3 * psi / divisor, rtol=1e-9, atol=1e-12)
 

@@ -5,7 +5,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, LANDER, make, random_episodes
+from airl_runs import CONFIG, LANDER, make, moved, random_episodes
 from msgspec.structs import replace
 
 from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
@@ -223,7 +223,7 @@ def test_past_challengers_are_replayed_beside_the_present_one(demos, monkeypatch
     for index in range(2):
         rollouts = trainer.train_round(index, learner)
         challenge = challengers.train_round(index)
-        challenge = [replace_observations(r, 5.0 + index) for r in challenge]
+        challenge = [moved(r, 5.0 + index) for r in challenge]
         learner.update(index, rollouts, trainer.policy, challenge)
     student, challenger = (
         [stratum for strata in risks for stratum in strata] for risks in drawn[-2:]
@@ -261,7 +261,7 @@ def test_challengers_are_negatives(demos):
         rollouts = trainer.train_round(0, learner)
         challenge = challengers.train_round(0)
         # Where the challengers were, made unlike all else.
-        challenge = [replace_observations(r, 5.0) for r in challenge]
+        challenge = [moved(r, 5.0) for r in challenge]
         learner.update(0, rollouts, trainer.policy, challenge)
         data = challenge[0].transitions(slice(None), HORIZON)
         with torch.no_grad():
@@ -269,16 +269,6 @@ def test_challengers_are_negatives(demos):
             g = learner.model.reward(torch.as_tensor(data.observations), actions)
         lowered[share] = float(g.mean()) - np.median(learner.quantiles)
     assert lowered[1.0] < min(lowered[0.0], -1.0)
-
-
-def replace_observations(rollout, value):
-    from dataclasses import replace as changed
-
-    return changed(
-        rollout,
-        observations=np.full_like(rollout.observations, value),
-        next_observations=np.full_like(rollout.next_observations, value),
-    )
 
 
 def test_challengers_need_logits_without_log_pi():
