@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tabular_demos import GOALS, MOVES, PATH, expert_demonstrations
 
-from irlcli.envs.gridworld.env import gridworld
+from irlcli.envs.gridworld.env import gridworld, walls
 from irlcli.learners.occupancy import demonstrations
 from irlcli.learners.soft_values import solve
 from irlcli.learners.tabular_quality import assess, log_likelihood
@@ -44,6 +44,18 @@ def test_the_true_reward_is_assessed_as_perfect_and_its_opposite_as_useless(goal
     # A larger reward makes the policy less random, and the expert is not random at all.
     assert (quality.log_likelihood[1] > quality.log_likelihood[0]).all()
     assert (quality.log_likelihood[0] > quality.log_likelihood[2] + 10.0).all()
+
+
+def test_the_reward_of_a_cell_behind_walls_does_not_change_the_rank_correlation():
+    settings = stack([gridworld(6, blocked=2)])
+    wall = walls(6, blocked=2)
+    plain = np.random.default_rng(0).normal(size=36)
+    raised = plain + 50.0 * wall
+    assert wall.any()
+    quality = assess(
+        settings, np.stack([plain, raised]), 40, expert_demonstrations(settings, [2], 6, 40)
+    )
+    assert quality.rank_correlation[1, 0] == quality.rank_correlation[0, 0]
 
 
 def test_a_constant_reward_has_no_rank_correlation():

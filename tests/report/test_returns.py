@@ -8,10 +8,12 @@ from irlcli.errors import UsageError
 from irlcli.report.returns import rows
 
 
-def evaluation(agent, mean, seed=None, made=None, **subject):
+def evaluation(agent, mean, seed=None, made=None, episodes=20, progress=None, **subject):
+    place = Returns(
+        setting="bounce=0.9", episodes=episodes, mean_return=mean, mean_progress=progress
+    )
     summary = Evaluation(
-        policy=Subject(agent=agent, env="lunar-lander", seed=seed, **subject),
-        settings=(Returns(setting="bounce=0.9", episodes=20, mean_return=mean),),
+        policy=Subject(agent=agent, env="lunar-lander", seed=seed, **subject), settings=(place,)
     )
     return summary, made or {}, False
 
@@ -31,6 +33,17 @@ def test_statistics_are_over_seeds():
     assert found[1].mean == 4.0
     assert found[1].deviation == pytest.approx(13.0**0.5)
     assert found[0].deviation is None
+
+
+def test_a_row_has_the_fewest_episodes_of_its_seeds():
+    (row,) = rows([evaluation("expert", 0.0, k, episodes=n) for k, n in enumerate((20, 5))])
+    assert row.episodes == 5
+
+
+@pytest.mark.parametrize(("measured", "mean"), [((3.0, None), None), ((3.0, 5.0), 4.0)])
+def test_progress_is_a_mean_over_all_seeds_or_unknown(measured, mean):
+    (row,) = rows([evaluation("expert", 0.0, k, progress=x) for k, x in enumerate(measured)])
+    assert row.progress == mean
 
 
 def test_experts_of_other_settings_are_rows_of_their_own():

@@ -128,7 +128,7 @@ def test_the_interval_contains_the_value_and_does_not_depend_on_the_run():
 
 
 def test_the_interval_covers_the_true_correlation():
-    """Of 60 banks of 20 policies from a population with r = 0.6, about 95 %."""
+    """Of 60 banks of 20 policies with r = 0.6, 57 on average, with a standard deviation of 1.7."""
     covered = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -142,7 +142,26 @@ def test_the_interval_covers_the_true_correlation():
             ]
         ).pearson
         covered += found.low <= 0.6 <= found.high
-    assert 51 <= covered <= 60
+    assert 54 <= covered <= 60
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_interval_of_constant_episodes_is_scipys_bootstrap(seed):
+    true, noise = np.random.default_rng(seed).normal(size=(2, 20))
+    learned = 0.6 * true + 0.8 * noise
+    constant = [
+        Member(f"{i}", "clone", "e", np.full(3, t), np.full(3, x), np.ones(3))
+        for i, (t, x) in enumerate(zip(true, learned, strict=True))
+    ]
+    found = agreement(constant).pearson
+    low, high = stats.bootstrap(
+        (true, learned),
+        lambda x, y, axis: stats.pearsonr(x, y, axis=axis).statistic,
+        paired=True,
+        method="percentile",
+        rng=0,
+    ).confidence_interval
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.02)
 
 
 def test_a_policy_is_resampled_with_all_its_settings():

@@ -9,6 +9,7 @@ import os
 import signal
 import stat
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -168,21 +169,28 @@ def test_failing_call_at_every_step_of_publish(tmp_path, expected_id, number, pe
     assert failures > 20
 
 
-def test_durable_before_visible(tmp_path):
-    """The page cache survives SIGKILL but not a power cut, so the order of calls matters."""
-    store = Store(_created(tmp_path / "runs"))
-    output = stage_output(store, FILES, "out.0")
+@contextmanager
+def recorded() -> Iterator[list[tuple[str, str]]]:
+    """The calls that make a path durable or visible, in order."""
     log: list[tuple[str, str]] = []
 
     def record(name: str, args: tuple, half: Callable[[], None]) -> None:
         if name == "fsync":
             target = args[0] if isinstance(args[0], int) else args[0].fileno()
             log.append((name, os.readlink(f"/proc/self/fd/{target}")))
-        elif name in ("rename", "link"):
+        elif name in ("rename", "replace", "link"):
             log.append((name, str(args[1])))
 
     with pytest.MonkeyPatch.context() as patch:
         intercept(patch.setattr, record)
+        yield log
+
+
+def test_durable_before_visible(tmp_path):
+    """The page cache survives SIGKILL but not a power cut, so the order of calls matters."""
+    store = Store(_created(tmp_path / "runs"))
+    output = stage_output(store, FILES, "out.0")
+    with recorded() as log:
         artefact = store.publish(RECORD, output, {}).artefact
     appears = log.index(("rename", str(artefact.directory)))
     claimed = log.index(("link", str(store.root / ".keys" / RECORD.key)))
@@ -194,6 +202,22 @@ def test_durable_before_visible(tmp_path):
         assert any(Path(p).name.startswith(f".{name}.") for p in durable)
     assert ("fsync", str(store.root)) in log[appears:claimed]
     assert ("fsync", str(store.root / ".keys")) in log[claimed:]
+
+
+def test_a_name_and_a_checkpoint_are_durable_when_written(tmp_path):
+    store = Store(_created(tmp_path / "runs"))
+    artefact = attempt(store).artefact
+    with store.working_on(RECORD.key, wait=False) as scratch, recorded() as log:
+        store.set_name("best", artefact)
+        scratch.save(b"state")
+    for path in (store.root / ".names" / "best", scratch.directory / "checkpoint"):
+        appears = log.index(("replace", str(path)))
+        # The content before, the name after.
+        assert any(
+            call == "fsync" and Path(p).name.startswith(f".{path.name}.")
+            for call, p in log[:appears]
+        )
+        assert ("fsync", str(path.parent)) in log[appears:]
 
 
 def test_published_files_are_read_only_and_scratch_is_gone(tmp_path):
