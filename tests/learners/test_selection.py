@@ -2,13 +2,21 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
-from airl_runs import CONFIG, SETTINGS, make, random_episodes
+from airl_runs import CONFIG, LANDER, SETTINGS, make, random_episodes
 
+from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
+from irlcli.data.tensors import load_policy_file, load_reward_file
+from irlcli.experiments.runner import Silent
 from irlcli.learners.selection import BestRound, hold_out, log_likelihood
+from irlcli.rl.rollout import roll_out
+from irlcli.stages import choose_penalty
+from irlcli.stages.base import Job, environment_key
 from irlcli.store import Store, read_json
 
 FIRST, SECOND = (str(s) for s in SETTINGS)
@@ -131,14 +139,82 @@ def test_the_selected_round_is_on_record(chosen, run_irl):
     assert done.code == 0, done.err
     artefact = chosen.resolve(json.loads(done.out)["id"]).artefact
     selected = read_json(chosen.open(artefact, "reward.json"))["selected"]
-    import pyarrow.parquet as pq
-
     rows = pq.read_table(chosen.open(artefact, "metrics.parquet")).to_pylist()
     scores = {row["round"]: row["score"] for row in rows}
     assert selected["score"] == max(scores.values()) == scores[selected["round"]]
     last = run_irl([*arguments[:-1], "last", "--dry-run"]).out
     plain = run_irl([*arguments[:-2], "--dry-run"]).out
     assert last == plain
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "chosen", "ties"),
+    [
+        ((9.0, 0.0), (5.0, 5.0), 1.0, 1),  # means 4.5 and 5
+        ((9.0, 2.0), (5.0, 5.0), 0.1, 1),  # means 5.5 and 5
+        ((9.0, 1.0), (5.0, 5.0), 0.1, 2),  # of equal means, the smaller lambda
+    ],
+)
+def test_the_largest_mean_is_chosen(tmp_path, first, second, chosen, ties):
+    inputs = {}
+    for weight, means in ((0.1, first), (1.0, second)):
+        for setting, mean in zip((FIRST, SECOND), means, strict=True):
+            path = tmp_path / f"{weight} {setting}.json"
+            returns = {"setting": setting, "episodes": 1, "mean_return": mean}
+            policy = {"agent": "student", "env": LANDER}
+            path.write_text(json.dumps({"policy": policy, "settings": [returns]}))
+            inputs[f"lambda {weight} without {setting}"] = path
+    parameters = choose_penalty.Parameters(
+        environment=environment_key(LANDER), settings=(FIRST, SECOND), weights=(0.1, 1.0), seed=0
+    )
+    choose_penalty.run(Job(parameters, inputs, tmp_path, None, Silent()))
+    made = read_json(tmp_path / "choice.json")
+    assert (made["chosen"], made["ties"]) == (chosen, ties)
+
+
+def test_held_out_episodes_are_not_trained_on(store_copy, tmp_path, irl):
+    """Two episodes of each setting: the second is held out, and scores the only round."""
+    demos = read_demonstrations(store_copy.path / store_copy.demos)
+    altered = tmp_path / "altered"
+    altered.mkdir()
+    groups = [
+        (setting, [kept, replace(held_out, observations=-held_out.observations)])
+        for setting in SETTINGS
+        for kept, held_out in [demos.trajectories[str(setting)]]
+    ]
+    write_demonstrations(altered, LANDER, groups, demos.metadata)
+    found = []
+    for source in ("demos", altered):
+        done = irl(
+            *("train-airl", "--demos", source, "--store", store_copy.path, "--profile", "smoke"),
+            *("--select", "episodes", "--set", "airl.total_steps=2048", "--json"),
+        )
+        assert done.code == 0, done.err
+        made = store_copy.path / json.loads(done.out)["id"]
+        found.append((load_reward_file(made / "reward.pt"), read_json(made / "reward.json")))
+    (one, _), (other, _) = (reward for reward, _ in found)
+    assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
+    # The scores differ: the altered episodes were read.
+    assert found[0][1]["selected"]["score"] != found[1][1]["selected"]["score"]
+
+
+def test_the_setting_that_selects_scores_by_true_return_and_is_not_trained_on(store_copy, irl):
+    done = irl(
+        *("train-airl", "--demos", "demos", "--store", store_copy.path, "--profile", "smoke"),
+        *("--select", FIRST, "--set", "airl.select_every=1", "--set", "airl.select_episodes=4"),
+        *("--set", "airl.total_steps=4096", "--seed", "3", "--json"),
+    )
+    assert done.code == 0, done.err
+    made = store_copy.path / json.loads(done.out)["id"]
+    reward = read_json(made / "reward.json")
+    assert reward["settings"] == [SECOND]
+    rows = pq.read_table(made / "metrics.parquet").to_pylist()
+    assert {row["setting"] for row in rows} == {SECOND}
+    scores = [row["score"] for row in rows]
+    assert reward["selected"]["score"] == max(scores) > min(scores)
+    policy, _ = load_policy_file(made / "policy.pt")
+    episodes = roll_out(LANDER, SETTINGS[0], policy, 4, 3, "selection")
+    assert max(scores) == pytest.approx(np.mean([t.episode_return for t in episodes]))
 
 
 @pytest.mark.parametrize(

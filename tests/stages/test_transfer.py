@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from irlcli.data.tensors import load_policy_file
+from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.learners.frozen import FrozenReward
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.store import Store
@@ -130,6 +130,35 @@ def test_the_retrained_policy_begins_as_the_student(runs, irl, words, monkeypatc
     shutil.copy(scratch.directory / "policy.pt", outside)
     foreign = irl(*command, *common(runs))
     assert foreign.code == 3 and "is not the student of the reward" in foreign.err
+
+
+def test_the_absorbing_series_is_discounted_by_the_retrained_policys_gamma(
+    store_copy, irl, monkeypatch
+):
+    """With gamma 0.5, that of the reward being 0.99, the final state counts 0.5 / (1 - 0.5) = 1."""
+    seen = []
+    original = FrozenReward.rewards
+
+    def spied(self, rollout, policy):
+        paid = original(self, rollout, policy)
+        seen.append((rollout.transitions(slice(None), 1000), paid.ravel()))
+        return paid
+
+    monkeypatch.setattr(FrozenReward, "rewards", spied)
+    line = ["transfer", "--reward", "airl", "--ood", "1.5x", *common(store_copy.path)]
+    one_round = ["--set", "transfer.ppo.gamma=0.5", "--set", "transfer.total_steps=1024"]
+    made(store_copy.path, irl(*line, *one_round))
+    model, about = load_reward_file(store_copy.path / store_copy.airl / "reward.pt")
+    ((steps, paid),) = seen
+    ended = steps.terminated
+    actions = torch.eye(4)[torch.as_tensor(steps.actions[ended])]
+    states, final = (
+        torch.as_tensor(s[ended]) for s in (steps.observations, steps.next_observations)
+    )
+    with torch.no_grad():
+        g = model.reward(states, actions) + 1.0 * model.reward(final, torch.zeros_like(actions))
+    assert about.network.gamma == 0.99 and ended.any()
+    assert paid[ended] == pytest.approx(g.numpy() / about.scale, rel=1e-4, abs=1e-6)
 
 
 def test_a_ceiling_changes_the_policy_and_evaluations_stay_unbounded(runs, irl):
