@@ -371,20 +371,6 @@ def test_a_fit_continued_from_a_state_ends_with_the_same_bits():
             assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def test_l2_of_5_adds_5_times_the_parameters_to_the_gradient():
-    settings = mazes()
-    risks = own_risks(soft_experts(settings, 1, 16))
-    phi = np.random.default_rng(0).normal(size=25)
-    gradients = []
-    for l2 in (0.0, 5.0):
-        learner = maxent(settings, np.eye(25), risks, l2=l2, hidden=0)
-        with torch.no_grad():
-            learner.networks.psi[0, :, 0] = torch.as_tensor(phi)
-        learner.step(record=False)
-        gradients.append(learner.networks.psi.grad[0, :, 0].numpy())
-    assert gradients[1] - gradients[0] == pytest.approx(5.0 * phi)
-
-
 def test_l2_and_the_penalty_change_the_fit():
     settings = mazes()
     risks = own_risks(soft_experts(settings, 1, 16))
