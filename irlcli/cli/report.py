@@ -84,11 +84,11 @@ def report(
         )
     match kind:
         case "returns":
-            _refuse(kind, options | _of_stages(session))
             if not refs:
                 raise UsageError(
                     "refs are missing: no evaluation is named", "irl report returns REF..."
                 )
+            _refuse(kind, options | _of_stages(session))
             _returns(session, refs)
         case "table2":
             _refuse(kind, options, "--format")

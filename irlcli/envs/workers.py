@@ -13,9 +13,11 @@ to step, and the answer that no episode ended.
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import signal
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -132,6 +134,12 @@ def _work(
             worlds.close()
 
 
+def _close(worlds: weakref.ref[WorkerWorlds]) -> None:
+    alive = worlds()
+    if alive is not None:
+        alive.close()
+
+
 class WorkerWorlds:
     """N environments distributed over worker processes, with the interface of ``VectorWorlds``.
 
@@ -190,6 +198,9 @@ class WorkerWorlds:
             theirs.close()
             self._channels.append(_Channel(answers, ask))
             self._processes.append(process)
+        # At exit, multiprocessing sends SIGTERM to its children and waits for them. These ignore it,
+        # so their pipes must be closed before. What is registered last runs first.
+        atexit.register(_close, weakref.ref(self))
 
     def __len__(self) -> int:
         return self._size

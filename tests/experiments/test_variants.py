@@ -134,7 +134,7 @@ def test_the_shipped_ablation():
     [
         ("airl.gradient_penalty=1", "airl.gradient_penalti=1", "unknown field", "gradient_penalty"),
         ("airl.gradient_penalty=1", "expert.total_steps=9", "expert.total_steps", "airl, transfer"),
-        ("airl.gradient_penalty=1", "airl.gradient_penalty=x", "gradient_penalty=x: Exp", "0.0"),
+        ("airl.gradient_penalty=1", "airl.gradient_penalty=x", "gradient_penalty=x: exp", "0.0"),
         ("airl.gradient_penalty=1", "airl.gradient_penalty", "has no '='", "write"),
         ("airl.gradient_penalty=1", "airl.penalty=irmv1", "which the method sets", "method"),
         ("airl.gradient_penalty=1", "transfer.algorithm=pppo", "transfer.algorithm 'pppo'", "ppo"),

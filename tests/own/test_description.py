@@ -97,7 +97,7 @@ def test_any_value_in_any_place_is_read_or_refused_with_a_hint(document, value, 
 WRONG = [
     ("[env]", "[evn]", 2, "unknown section 'evn'", "did you mean 'env'"),
     ('id = "cart:Cart-v0"', "", 2, "env.id is missing", "module:EnvId"),
-    ('id = "cart:Cart-v0"', "id = 3", 2, "env.id: Expected `str", "own-environments"),
+    ('id = "cart:Cart-v0"', "id = 3", 2, "env.id: expected text", "own-environments"),
     ('id = "cart:Cart-v0"', 'id = "c art:Cart-v0"', 2, "'c art:Cart-v0'", "module:EnvId"),
     ('id = "cart:Cart-v0"', 'id = "crat:Cart-v0"', 3, "no module 'crat'", "crat.py"),
     ('id = "cart:Cart-v0"', 'entry_point = "Cart"', 2, "env.entry_point: 'Cart'", "module:Class"),
