@@ -86,6 +86,11 @@ def run_main(arguments: list[str]) -> Result:
     return Result(code, out.getvalue(), err.getvalue())
 
 
+def pytest_collection_modifyitems(items):
+    """The longest tests come first: at the end of a parallel run no worker waits for another."""
+    items.sort(key=lambda item: "torture" not in item.path.parts)
+
+
 @pytest.fixture(scope="session")
 def smoke_store(tmp_path_factory: pytest.TempPathFactory) -> SmokeStore:
     """collect-experts, train-airl (irm), transfer and evaluate with ``--profile smoke``."""
