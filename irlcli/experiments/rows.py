@@ -49,7 +49,8 @@ from irlcli.store import file_digest, read_json
 
 Phase = Literal["experts", "demos", "rewards", "transfers", "returns"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
-# A reward's first policy is retrained with the reward's own seed, the next ones with seeds this far apart.
+# A reward's first policy is retrained with the reward's own seed, the next ones with seeds this far
+# apart.
 _NEXT_RETRAINING = 1000
 
 
