@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pyarrow as pa
@@ -13,7 +13,9 @@ import pyarrow as pa
 from irlcli.configs import PPOConfig, SACConfig
 from irlcli.data import descriptions, tensors
 from irlcli.data.parquet import write_table
-from irlcli.rl.policy import Policy, describe
+
+if TYPE_CHECKING:
+    from irlcli.rl.policy import Policy
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -42,6 +44,8 @@ def write_policy(
 
     ``origin`` holds the fields of :class:`descriptions.Policy` other than ``network``.
     """
+    from irlcli.rl.policy import describe
+
     description = descriptions.Policy(network=describe(config), **origin)
     tensors.save(directory / "policy.pt", "policy", description, policy.state_dict())
     write_json(directory / "policy.json", msgspec.to_builtins(description))

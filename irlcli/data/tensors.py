@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import torch
@@ -28,7 +28,9 @@ from irlcli.data import descriptions
 from irlcli.errors import IntegrityError, NewerFormat, UsageError
 from irlcli.interventions import parse_setting
 from irlcli.learners.reward_model import RewardModule, build
-from irlcli.rl.policy import Policy, load_policy
+
+if TYPE_CHECKING:
+    from irlcli.rl.policy import Policy
 
 SCHEMA = 1
 # The networks here have tens of thousands of parameters.
@@ -193,6 +195,9 @@ def load_policy_file(path: Path) -> tuple[Policy, descriptions.Policy]:
         UsageError, IntegrityError: as :func:`load`; also tensors that do not fit the description
             or are not finite.
     """
+    # Stable-baselines3 takes half a second to import, and gridworlds do not need it.
+    from irlcli.rl.policy import load_policy
+
     description, state = load(path, "policy")
     try:
         setting = parse_setting(description.env, description.settings[0])

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import importlib
 import json
 import os
+import pkgutil
 import random
 import shutil
 import signal
@@ -67,14 +69,16 @@ def preload() -> None:
 
 
 def warm_up() -> None:
-    """Load the libraries of the stages once, before forking."""
-    import matplotlib  # noqa: F401
-    import pyarrow.parquet  # noqa: F401
-    import scipy.special  # noqa: F401
+    """Load what the stages import once, before forking: else imports are most of a trial's time."""
     import torch
     import torch._dynamo  # the first optimiser imports it, which takes a second
 
+    import irlcli
+
     torch.set_num_threads(1)
+    for module in pkgutil.walk_packages(irlcli.__path__, "irlcli."):
+        if module.name.split(".")[1] in ("cli", "data", "report", "requests", "rl", "stages"):
+            importlib.import_module(module.name)
 
 
 class Child:
