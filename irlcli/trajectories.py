@@ -22,7 +22,7 @@ class Trajectory:
         truncated: a time limit ended it; its value afterwards is not zero.
         seed: what the environment was reset with; -1 if that is unknown.
         progress: sum of the environment's progress; NaN if it reports none or was not kept.
-        error: what ended an episode that could not go on, if anything.
+        error: the error on which the episode stopped, if any.
 
     Raises:
         ValueError: shapes, types or flags that do not fit, or numbers that are not finite.

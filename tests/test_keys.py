@@ -615,6 +615,22 @@ def test_the_version_of_a_stage_changes_its_key_and_those_made_from_it(monkeypat
         assert differs == runs, name
 
 
+@pytest.mark.parametrize("stage", ["train-airl", "train-maxent"])
+def test_the_version_of_a_penalty_changes_the_keys_of_its_rewards_alone(monkeypatch, stage):
+    request, _ = REQUESTS[stage]
+    section = "airl" if stage == "train-airl" else "maxent"
+    found = {}
+    for version in (1, 2):
+        of = PENALTIES["vrex"]._replace(version=version)
+        monkeypatch.setitem(PENALTIES, "vrex", of)
+        for penalty in ("vrex", "irmv1"):
+            config = with_field(in_use(), f"{section}.penalty", penalty)
+            config = with_field(config, f"{section}.grouping", "per-setting")
+            found[penalty, version] = key(request(config))
+    assert found["vrex", 1] != found["vrex", 2]
+    assert found["irmv1", 1] == found["irmv1", 2]
+
+
 # Their seeds are fields of their configs.
 SWEEPS = ("sweep-maxent", "figure2", "control", "control-labels", "control-maps")
 

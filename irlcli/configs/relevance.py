@@ -85,7 +85,7 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     if airl.grouping == "pooled":
         airl = replace(airl, pairing=_AIRL.pairing)
     if airl.logit == "f":
-        # f is all that w could multiply.
+        # w multiplies f, with either scaling.
         airl = replace(airl, penalty_scaling=_AIRL.penalty_scaling)
     if not airl.shaping and airl.policy_reward == "g":
         airl = replace(airl, policy_reward="f")

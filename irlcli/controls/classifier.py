@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import dropout
 
-from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
+from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
 from irlcli.penalties.risk import cross_entropy
 
 # Sums over weights or over samples: of all runs together they are the sum of each run's.
@@ -82,6 +82,8 @@ def train(
 ) -> Networks:
     """Minimise (mean_e R_e + lambda penalty) / max(1, lambda) by Adam, full batch.
 
+    A bounded penalty is not divided (:func:`irlcli.penalties.loss_divisor`).
+
     The penalty is the plain one. The unbiased estimate has no lower bound on samples that stay the
     same: a network can make the halves' gradients disagree.
 
@@ -103,7 +105,8 @@ def train(
             loss = risks.mean(1).sum()
             if step >= schedule.warmup and method.weight:
                 penalised = _penalty(method.penalty, networks, samples, logits, risks, options)
-                loss = (loss + method.weight * penalised) / max(1.0, method.weight)
+                loss = loss + method.weight * penalised
+                loss = loss / loss_divisor(method.penalty, method.weight)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

@@ -16,7 +16,8 @@ Absorbing states. Where episodes may end early, the sign of a learned reward alo
 task (Kostrikov et al. 2019). Here an ended episode stays in an absorbing state that keeps its final
 observation. The time limit is bootstrapped through, so the state is worth the geometric series
 f / (1 - gamma), added in closed form. The discriminator sees the state as often as stepping on to
-the horizon would show it.
+the horizon would show it, if a round is at least as long as the horizon. In shorter rounds it sees
+the state too often.
 """
 
 from __future__ import annotations

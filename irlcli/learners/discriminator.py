@@ -12,7 +12,7 @@ import torch
 
 from irlcli.learners.pools import Minibatch
 from irlcli.learners.reward_model import RewardModel
-from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
+from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
 from irlcli.penalties.risk import cross_entropy
 
 
@@ -66,8 +66,9 @@ def discriminator_loss(
     """(share sum_e w_e BCE_e + beside + lambda penalty) / max(1, lambda) (paper Eq. 5, Algorithm 1).
 
     The paper sums over settings where this averages. Dividing by lambda keeps the gradient's size
-    when the penalty dominates. Penalties of risks do not see challengers, which are told from
-    experts so easily that the penalty would be small for any reward; ``input-gradient`` does.
+    when the penalty dominates; a bounded one does not (:func:`irlcli.penalties.loss_divisor`).
+    Penalties of risks do not see challengers: they are so easy to distinguish from experts that the
+    penalty would be small for any reward. ``input-gradient`` sees them.
 
     Args:
         logits: f - log pi [E, 2, B].
@@ -89,7 +90,8 @@ def discriminator_loss(
     penalised = discriminator_penalty(penalty)(seen, options)
     total = share * risk + beside
     if options.weight > 0.0:
-        total = (total + options.weight * penalised) / max(1.0, options.weight)
+        total = total + options.weight * penalised
+        total = total / loss_divisor(penalty, options.weight)
     return Loss(total, risk.detach(), penalised.detach())
 
 

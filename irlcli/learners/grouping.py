@@ -30,7 +30,8 @@ class Group(NamedTuple):
 def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> list[Group]:
     """The groups of E settings with ``counts`` [E] episodes.
 
-    - ``pooled``: one group, every episode weighted equally (ERM). Each setting has its own part, so
+    - ``pooled``: one group, every episode weighted equally (ERM), up to the rounding of
+      :func:`apportion`. Each setting has its own part, so
       that the policy's samples, which are paired with a part's settings, have the same shares.
       Otherwise a discriminator could learn how often a setting was demonstrated.
     - ``balanced`` and ``per-setting``: one group per setting, of equal weight. Balanced groups

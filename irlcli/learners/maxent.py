@@ -23,7 +23,7 @@ import torch
 from irlcli.learners.grouping import Group, Part, group
 from irlcli.learners.occupancy import Demonstrations, mean_occupancy
 from irlcli.learners.soft_values import Solution, solve
-from irlcli.penalties import Occupancies, occupancy_penalty
+from irlcli.penalties import Occupancies, loss_divisor, occupancy_penalty
 from irlcli.seeds import derive
 from irlcli.tabular import StackedMDPs
 
@@ -149,7 +149,11 @@ class RewardNetworks(torch.nn.Module):
 
 
 class Record(NamedTuple):
-    """Diagnostics of one iteration, before its update."""
+    """Diagnostics of one iteration, before its update.
+
+    The likelihood covers the whole horizon. A choice in the absorbing goal is as likely as any other,
+    so each step there costs log A nats. Compare it within a run only.
+    """
 
     iteration: int
     log_likelihood: np.ndarray  # [R, E], of each setting's demonstrations [nats per episode]
@@ -179,7 +183,8 @@ class MaxEnt:
         kinds: [R, E, S], the kind of each state, where the settings look different or runs have
             different worlds; None: every state is a kind of its own, the same in every setting.
         penalty_warmup: iterations at lambda = 0. After them the whole objective is divided by
-            max(1, lambda), as the discriminator's is: RMSProp has then adapted to the risk's scale.
+            :func:`irlcli.penalties.loss_divisor`, as the discriminator's is: RMSProp has then adapted
+            to the risk's scale.
 
     Raises:
         ValueError: shapes that do not fit; a width or rate out of range; weights, penalty weights
@@ -234,6 +239,7 @@ class MaxEnt:
         self._expert = _expert_occupancy(self._risks)
         self._penalty = occupancy_penalty(penalty)
         self._penalty_weight = np.asarray(penalty_weight)
+        self._divisor = np.array([loss_divisor(penalty, w) for w in self._penalty_weight])
         self._penalty_warmup = penalty_warmup
         self._l2 = torch.as_tensor(np.asarray(l2, dtype=np.float64)).reshape(runs, 1, 1)
         self._features = torch.as_tensor(features)
@@ -274,7 +280,7 @@ class MaxEnt:
         if self.iterations < self._penalty_warmup:
             weight = np.zeros(len(phi))
         elif self._penalty_warmup:
-            divisor = np.maximum(1.0, weight)
+            divisor = self._divisor
         negative = -(risks.shares * each).sum(-1)
         penalty, penalty_gradient = self._penalty(
             Occupancies(phi, gap, risks.weights, negative, response, weight)

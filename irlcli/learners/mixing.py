@@ -2,8 +2,8 @@
 
 What experts do comes together: a walking ant has certain poses and a certain velocity. From experts
 and policies alone a reward may learn to value the poses, and a new policy takes the poses without
-the velocity. In a mixed sample each number is the expert's or the challenger's. To tell it from an
-expert's, a reward has to depend on all of them.
+the velocity. In a mixed sample each number is the expert's or the challenger's. To distinguish
+it from an expert's, a reward has to depend on all of them.
 """
 
 from __future__ import annotations

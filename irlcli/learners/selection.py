@@ -6,11 +6,13 @@ selected by data of the settings trained on, never by the setting that a method 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from irlcli.errors import StageFailed
 from irlcli.learners.actions import ActionView, Policy
 from irlcli.trajectories import Trajectory, transitions
 
@@ -34,10 +36,19 @@ class BestRound:
         self.best: dict[str, Any] = {}
 
     def consider(self, index: int, policy: Any) -> dict[str, float]:
-        """The score of round ``index``, NaN where none is due. Of equal rounds the first is kept."""
+        """The score of round ``index``, NaN where none is due. Of equal rounds the first is kept.
+
+        Raises:
+            StageFailed: the score is not a finite number.
+        """
         if (index + 1) % self._every and index + 1 != self._rounds:
             return {"score": float("nan")}
         score = self._score(policy)
+        if not math.isfinite(score):
+            raise StageFailed(
+                f"the score of round {index} is {score}, so no round can be selected",
+                "airl.select = last needs no score",
+            )
         if not self.best or score > self.best["score"]:
             self.best = {
                 "round": index,

@@ -1,7 +1,7 @@
 """When adversarial training may end before its budget.
 
 The rule sees neither a true return nor an unseen setting. The student imitates when the discriminator
-cannot tell its samples from the expert's: the cross-entropy nears ln 2, that of a coin. Once it is
+cannot tell its samples from the expert's: the cross-entropy nears ln 2, that of guessing. Once it is
 near and rises no further, more rounds only repeat themselves.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-# Students that fail stop rising, too, but far below a coin's ln 2.
+# Students that fail stop rising, too, but far below ln 2.
 NEAR_CHANCE = 0.95 * math.log(2.0)
 
 

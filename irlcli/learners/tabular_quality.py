@@ -17,12 +17,13 @@ class Quality:
     """Measures of R rewards in E settings, each [R, E].
 
     The first four concern the policy that is optimal for the recovered reward; the last one
-    concerns the reward's maximum-entropy policy.
+    concerns the reward's maximum-entropy policy. Demonstrations end at the goal, so their likelihood
+    does not count the choices in the absorbing state, as :class:`irlcli.learners.maxent.Record` does.
     """
 
     goal_probability: np.ndarray  # of reaching the goal within the horizon
     true_return: np.ndarray
-    value_difference: np.ndarray  # optimal true return minus true_return, at least 0
+    value_difference: np.ndarray  # true return of the optimal policy minus true_return
     rank_correlation: np.ndarray  # Spearman's, of its optimal value and the true one over states
     log_likelihood: np.ndarray  # of held-out episodes [nats per episode]
 

@@ -1,4 +1,4 @@
-"""Penalties: what is added to the risks, lambda times. One small file each; this loads no torch.
+"""Penalties: terms that are added to the risks, times lambda. One small file each; no torch is loaded.
 
 A penalty of adversarial learners is a function ``discriminator(samples, options)`` of
 :class:`Samples` to a scalar tensor, differentiable in the discriminator's weights.
@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple
+
+from msgspec import UNSET, UnsetType
 
 from irlcli.errors import UsageError, suggest
 from irlcli.methods import METHODS
@@ -28,7 +30,8 @@ class Samples(NamedTuple):
         logits: of the discriminator [E, 2, B]: E risks, label 0 is the policy and 1 the expert.
         f: their learned part [E, 2, B], f = logits + log pi(a|s).
         risks: the cross-entropy of each risk [E].
-        weights: of the risks in the loss [E].
+        weights: of the risks in the loss [E]. Only group-dro uses them; to the other penalties all
+            risks are equal.
         parameters: what the discriminator learns.
         slope: the mean squared gradient of g by its input, a scalar, computed when called.
     """
@@ -77,7 +80,7 @@ class Occupancies(NamedTuple):
 
 
 class Penalty(NamedTuple):
-    """Where a penalty's functions are, and what they are for.
+    """A penalty's module, and what the learners must know of it.
 
     Attributes:
         module: its path.
@@ -85,6 +88,9 @@ class Penalty(NamedTuple):
         compares: whether it compares risks with each other, so that it needs at least two.
         reads: which of ``airl.penalty_scaling`` and ``airl.penalty_estimate`` can change it.
         candidates: for lambda, as many for each penalty: a lambda means another thing in each.
+        bounded: whether lambda times the penalty is bounded for any lambda, so that the loss is not
+            divided by lambda.
+        version: a change that alters its results must raise it. It is part of the keys.
     """
 
     module: str
@@ -92,6 +98,8 @@ class Penalty(NamedTuple):
     compares: bool = False
     reads: tuple[str, ...] = ("penalty_scaling", "penalty_estimate")
     candidates: tuple[float, ...] = (1.0, 100.0, 10_000.0)
+    bounded: bool = False
+    version: int = 1
 
 
 # Name to module, one line each.
@@ -102,7 +110,13 @@ PENALTIES: dict[str, Penalty] = {
     "closed-form": Penalty("irlcli.penalties.closed_form", ("maxent",)),
     "vrex": Penalty("irlcli.penalties.vrex", ("airl", "maxent"), True, ("penalty_estimate",)),
     "group-dro": Penalty(
-        "irlcli.penalties.group_dro", ("airl", "maxent"), True, (), (1.0, 10.0, 100.0)
+        "irlcli.penalties.group_dro",
+        ("airl", "maxent"),
+        True,
+        (),
+        (1.0, 10.0, 100.0),
+        bounded=True,
+        version=2,
     ),
     "iga": Penalty("irlcli.penalties.iga", ("airl",), True, ("penalty_estimate",)),
     "input-gradient": Penalty(
@@ -161,6 +175,20 @@ def check_risks(name: str, grouping: str, settings: int) -> None:
             f"penalty {name!r} compares risks, and grouping {grouping!r} makes one of all settings",
             "--grouping per-setting, or shuffled as a control",
         )
+
+
+def loss_divisor(name: str, weight: float) -> float:
+    """What a loss with lambda = ``weight`` is divided by, which keeps the gradient's size.
+
+    max(1, lambda), but 1 for a penalty that is bounded.
+    """
+    return 1.0 if PENALTIES[name].bounded else max(1.0, weight)
+
+
+def penalty_version(name: str) -> int | UnsetType:
+    """The version of a penalty for keys: unset, and so not part of the key, while it is 1."""
+    version = PENALTIES[name].version
+    return UNSET if version == 1 else version
 
 
 def discriminator_penalty(name: str) -> Callable[[Samples, PenaltyOptions], torch.Tensor]:

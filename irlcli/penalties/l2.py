@@ -1,7 +1,8 @@
 """L2: the squared size of the weights, whatever the setting.
 
-The control for a penalty whose gain may be shrinkage alone. Part of the loss, unlike
-``airl.weight_decay``, which is decoupled from it (AdamW) and present in every method.
+The control for a penalty whose gain may be shrinkage alone. Part of the loss, so Adam rescales its
+gradient: lambda is not a rate of decay. ``airl.weight_decay`` has one; it is decoupled from the loss
+(AdamW) and present in every method.
 """
 
 from __future__ import annotations
@@ -15,5 +16,5 @@ if TYPE_CHECKING:
 
 
 def discriminator(samples: Samples, options: PenaltyOptions) -> torch.Tensor:
-    """||theta||^2 / 2 of all weights, a scalar: lambda is the rate of their decay."""
+    """||theta||^2 / 2 of all weights, a scalar."""
     return 0.5 * sum((p.square().sum() for p in samples.parameters), samples.risks.new_zeros(()))

@@ -79,7 +79,7 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
                 f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
             found.append(
-                f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.seeds} retrained "
+                f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.policies} retrained "
                 f"policies. {' '.join(parts)}"
             )
     return found

@@ -218,13 +218,14 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
 def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """What the frozen rewards score, a row per row and method.
 
-    Columns: ``row``, ``agent``; ``seeds`` that have both evaluations; ``retrained`` and
-    ``expert``, mean learned returns of the retrained policies and of the held-out setting's expert;
-    ``short``, seeds whose retrained policy falls short of the expert, and ``short_scored_higher``,
-    those of them because of a wrong reward: see :func:`irlcli.report.reward_quality.judge`, which
-    also needs the random agent's return.
+    Columns: ``row``, ``agent``; ``seeds`` and retrained ``policies`` that have both evaluations;
+    ``retrained`` and ``expert``, mean learned returns of the retrained policies and of the held-out
+    setting's expert; ``short``, the policies that fall short of the expert, and
+    ``short_scored_higher``, those of them because of a wrong reward: see
+    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return.
     """
-    columns = ["row", "agent", "seeds", "retrained", "expert", "short", "short_scored_higher"]
+    counted = ["seeds", "policies", "retrained", "expert", "short", "short_scored_higher"]
+    columns = ["row", "agent", *counted]
     found = []
     for row in p.rows if "transfer" in p.measures else ():
         random = sample(points, row.name, "random", "ood")["true_return"].mean()
@@ -232,16 +233,15 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             of = points[(points["row"] == row.name) & (points["agent"] == method)]
             of = of[of["learned_return"].notna()]
             policies, experts = (of[of["measure"] == m] for m in ("transfer", EXPERT_BY_REWARD))
-            policies = policies.groupby("seed", as_index=False)[
-                ["true_return", "learned_return"]
-            ].mean()
+            policies = policies[["seed", "true_return", "learned_return"]]
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
                 continue
             verdicts = [_verdict(r, random) for r in both.itertuples()]
             means = (float(both[n].mean()) for n in ("learned_return", "learned_return_expert"))
             counts = len(both) - verdicts.count("retrained"), verdicts.count("wrong reward")
-            found.append((row.name, method, len(both), *means, *counts))
+            seeds = both["seed"].nunique()
+            found.append((row.name, method, seeds, len(both), *means, *counts))
     return pd.DataFrame(found, columns=columns)
 
 

@@ -41,7 +41,7 @@ _ZERO_SHOT_NOTE = (
 _LEARNED_NOTE = (
     "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
     "discounts), mean over seeds; of the policy retrained on that reward, and of the held-out "
-    "setting's expert. Short: seeds whose retrained policy has a regret of more than 10 % of what the "
+    "setting's expert. Short: policies with a regret of more than 10 % of what the "
     "expert earns above the random agent. Scored higher: those of them that the reward scores at least "
     "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
     "show that the reward is right. Both are scored under the transfer.ceiling that the policy was "
@@ -216,7 +216,7 @@ def learned_returns(found: pd.DataFrame) -> Table:
             str(r.seeds),
             number(r.retrained),
             number(r.expert),
-            f"{r.short}/{r.seeds}",
+            f"{r.short}/{r.policies}",
             f"{r.short_scored_higher}/{r.short}" if r.short else "",
         ]
         for r in found.itertuples()

@@ -231,7 +231,7 @@ class Training:
         ]
 
     def _errors(self, index: int, rollouts: Sequence[Rollout]) -> list[str]:
-        """The worlds whose episode could not go on."""
+        """The worlds whose episode stopped on an error."""
         settings = world_settings(rollouts[0].terminated.shape[1], len(self.settings))
         return [
             f"{self.settings[settings[world]]}, world {world}, round {index}: {error}; the episode "

@@ -1,4 +1,4 @@
-"""Wrappers that pay a learned reward in place of the true one, for anybody's algorithm."""
+"""Wrappers that pay a learned reward in place of the true one, for any training algorithm."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class Job(NamedTuple):
     workers: int = 1
 
     def warn_of_errors(self, setting: str, trajectories: Sequence[Trajectory]) -> None:
-        """Name the episodes that could not go on."""
+        """Name the episodes that stopped on an error."""
         for k, trajectory in enumerate(trajectories):
             if trajectory.error is not None:
                 self.console.warn(f"{setting}, episode {k}: {trajectory.error}; it ended there")

@@ -250,4 +250,4 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
     return rows
 
 
-STAGE = Stage("control-maps", 1, run)
+STAGE = Stage("control-maps", 2, run)

@@ -15,7 +15,7 @@ from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.methods import method_name
-from irlcli.penalties import check_risks
+from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import (
     EnvironmentKey,
     From,
@@ -42,6 +42,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     seed: int
     airl: AIRLConfig
+    penalty_version: int | msgspec.UnsetType = msgspec.UNSET
 
 
 def request(
@@ -108,6 +109,7 @@ def request(
         settings=texts,
         seed=seed,
         airl=relevant,
+        penalty_version=penalty_version(relevant.penalty),
     )
     check_risks(parameters.airl.penalty, parameters.airl.grouping, trained)
     label = f"train-airl {describe(parameters.airl)} {env} {', '.join(texts)} seed {seed}"

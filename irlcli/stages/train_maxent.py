@@ -14,7 +14,7 @@ from irlcli.configs.relevance import relevant_maxent
 from irlcli.errors import IntegrityError
 from irlcli.interventions import Setting, check_tabular
 from irlcli.methods import method_name
-from irlcli.penalties import check_risks
+from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import (
     EnvironmentKey,
     From,
@@ -42,6 +42,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     unseen: tuple[str, ...]
     seed: int
     maxent: MaxEntConfig
+    penalty_version: int | msgspec.UnsetType = msgspec.UNSET
 
 
 def request(
@@ -64,12 +65,14 @@ def request(
     """
     check_tabular(env, "train-maxent", wanted=True)
     texts = tuple(str(s) for s in settings_)
+    relevant = relevant_maxent(maxent)
     parameters = Parameters(
         environment=environment_key(env),
         settings=texts,
         unseen=tuple(str(s) for s in unseen),
         seed=seed,
-        maxent=relevant_maxent(maxent),
+        maxent=relevant,
+        penalty_version=penalty_version(relevant.penalty),
     )
     check_risks(parameters.maxent.penalty, parameters.maxent.grouping, len(texts))
     label = f"train-maxent {describe(parameters.maxent)} {env} {', '.join(texts)} seed {seed}"

@@ -81,7 +81,7 @@ def request(
 
 
 def run(job: Job) -> None:
-    """Train on g / scale. The metrics report the true return, which neither training nor choice sees."""
+    """Train on g / scale. The true return is in the metrics only: no training or choice uses it."""
     import numpy as np
 
     from irlcli.data.outputs import write_metrics, write_policy

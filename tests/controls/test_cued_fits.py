@@ -102,6 +102,16 @@ def test_the_risk_of_a_setting_is_its_negative_log_likelihood(data):
     assert np.allclose(np.mean(each, axis=0), -fitted.log_likelihood, rtol=1e-3)
 
 
+def test_group_dro_nears_the_smallest_worst_risk_as_lambda_grows(data):
+    """Its loss does not grow with lambda, so a large one must not make the steps small."""
+    weights = (0.0, 10.0, 100.0)
+    chosen = [Variant("per-setting", "group-dro", weight) for weight in weights]
+    fitted = fit(WORLD, data, chosen, LINEAR, SEEDS)
+    risks = np.stack([held_out_risk(WORLD, data, e, fitted) for e in (0, 1)])
+    worst = risks.max(axis=0).mean(axis=-1)
+    assert worst[2] < worst[0] and worst[2] <= worst[1] + 1e-3
+
+
 def test_a_setting_that_is_left_out_is_gone(data):
     (kept,) = without(data, 0).maps.kinds.swapaxes(0, 1)
     assert np.array_equal(kept, data.maps.kinds[:, 1])

@@ -12,6 +12,7 @@ from airl_runs import CONFIG, LANDER, SETTINGS, make, random_episodes
 
 from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
 from irlcli.data.tensors import load_policy_file, load_reward_file
+from irlcli.errors import StageFailed
 from irlcli.experiments.runner import Silent
 from irlcli.learners.selection import BestRound, hold_out, log_likelihood
 from irlcli.rl.rollout import roll_out
@@ -53,6 +54,14 @@ def test_the_first_of_the_best_rounds_is_kept_and_put_back(networks):
         assert torch.equal(tensor, reward["model"][name])
     assert learner.scale == reward["scale"]
     assert not all(torch.equal(policy[k], states[6][0][k]) for k in policy)
+
+
+@pytest.mark.parametrize("score", [math.nan, math.inf])
+def test_a_score_that_is_not_finite_ends_training(networks, score):
+    """NaN is above nothing and below nothing, so the first round would be kept for ever."""
+    trainer, learner = networks
+    with pytest.raises(StageFailed, match=f"round 0 is {score}"):
+        BestRound(lambda policy: score, learner, every=1, rounds=2).consider(0, trainer.policy)
 
 
 def test_log_likelihood_weighs_settings_not_steps(networks, demos):

@@ -98,8 +98,8 @@ def test_learned_returns_rank_policy_and_expert():
     report = scored(pairs)
     assert report.learned_returns.to_dict("records") == [
         {
-            **{"row": BOUNCE, "agent": agent, "seeds": 3, "retrained": policy, "expert": expert},
-            **{"short": 3, "short_scored_higher": higher},
+            **{"row": BOUNCE, "agent": agent, "seeds": 3, "policies": 3},
+            **{"retrained": policy, "expert": expert, "short": 3, "short_scored_higher": higher},
         }
         for agent, policy, expert, higher in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 1))
     ]
@@ -122,6 +122,18 @@ def test_only_policies_that_fall_short_count_as_scored_higher(returns, short):
     (found,) = report.learned_returns.itertuples()
     assert (found.agent, found.short, found.short_scored_higher) == ("erm", short, 0)
     assert any(c.startswith("Short of") for c in report.caveats) == (short > 0)
+
+
+def test_every_retrained_policy_of_a_reward_is_judged():
+    """Of two policies on one reward one is as good as the expert; their mean would be short, too."""
+    values = complete() | {(BOUNCE, "erm", "transfer"): [280.0, 280.0, 280.0]}
+    values[BOUNCE, "erm", EXPERT_BY_REWARD] = [280.0] * 3
+    p, points = example(values)
+    second = points[(points["measure"] == "transfer") & (points["agent"] == "erm")]
+    points = pd.concat([points, second.assign(true_return=-100.0)], ignore_index=True)
+    points["learned_return"] = 1.0
+    (found,) = build(p, points, {}, {}).learned_returns.itertuples()
+    assert (found.seeds, found.policies, found.short) == (3, 6, 3)
 
 
 def test_learned_returns_need_both_evaluations_of_a_seed():
