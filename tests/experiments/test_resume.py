@@ -57,6 +57,13 @@ def start(store, stage):
     )
 
 
+def run_here(store, stage, *console):
+    """The artefact of ``stage``, made in this process."""
+    namespace = {}
+    exec(CHAIN, namespace)
+    return Runner(store, *console).run(namespace["request"](stage))
+
+
 def finish(process):
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
@@ -72,12 +79,15 @@ def checkpoints(store):
     return found
 
 
-def kill_after_checkpoint(store, process):
-    """SIGKILL the process right after it wrote a checkpoint; False if it ended before."""
+def kill_after_checkpoint(store, process, resumed=False):
+    """SIGKILL the process right after it wrote a checkpoint; False if it ended before.
+
+    The checkpoint is the first one of a stage, or, with ``resumed``, any.
+    """
     before = checkpoints(store)
     while process.poll() is None:
         now = checkpoints(store)
-        if any(before.get(path) != stamp for path, stamp in now.items()):
+        if now.keys() - before.keys() or (resumed and now != before):
             os.kill(process.pid, signal.SIGKILL)
             process.communicate()
             return True
@@ -87,12 +97,13 @@ def kill_after_checkpoint(store, process):
 
 
 def test_killed_stages_end_in_the_same_bytes(tmp_path):
-    undisturbed = finish(start(tmp_path / "a", "transfer"))
-    for stage in ("collect-experts", "train-airl", "transfer"):
-        # One round at least is left after either kill, so that resuming is what finishes it.
-        assert kill_after_checkpoint(tmp_path / "b", start(tmp_path / "b", stage)), stage
-        kill_after_checkpoint(tmp_path / "b", start(tmp_path / "b", stage))
-        last = finish(start(tmp_path / "b", stage))
+    undisturbed = run_here(tmp_path / "a", "transfer").manifest.id
+    # Two experts, AIRL twice, and the retrained policy. One round at least is left after each kill,
+    # so that resuming is what finishes it.
+    for resumed in (False, False, False, True, False):
+        process = start(tmp_path / "b", "transfer")
+        assert kill_after_checkpoint(tmp_path / "b", process, resumed)
+    last = finish(start(tmp_path / "b", "transfer"))
     assert last == undisturbed
     a, b = Store(tmp_path / "a"), Store(tmp_path / "b")
     assert a.ids() == b.ids()
@@ -192,11 +203,9 @@ def test_a_damaged_checkpoint_is_reported_and_not_used(tmp_path):
         def warn(self, message):
             warnings.append(message)
 
-    namespace = {}
-    exec(CHAIN, namespace)
-    artefact = Runner(tmp_path, Console()).run(namespace["request"]("collect-experts"))
+    artefact = run_here(tmp_path, "collect-experts", Console())
     assert any("damaged" in w and "starting over" in w for w in warnings)
-    assert artefact.manifest.id == finish(start(tmp_path / "other", "collect-experts"))
+    assert artefact.manifest.id == run_here(tmp_path / "other", "collect-experts").manifest.id
 
 
 def test_processes_that_ask_for_the_same_artefact_share_the_work(tmp_path):

@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,6 +13,7 @@ import torch
 from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.learners.frozen import FrozenReward
 from irlcli.rl.ppo import PPOTrainer
+from irlcli.rl.sac import SACTrainer
 from irlcli.store import Store
 
 
@@ -51,6 +50,20 @@ def made(store, done):
     return Store(store).resolve(done.out.strip().rpartition("/")[2]).artefact
 
 
+def interrupt(trainer, count, monkeypatch):
+    """Send this process a SIGINT in the ``count``-th round; the rounds that ``trainer`` ran."""
+    original, rounds = trainer.train_round, []
+
+    def interrupted(self, index, source):
+        rounds.append(index)
+        if len(rounds) == count:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(self, index, source)
+
+    monkeypatch.setattr(trainer, "train_round", interrupted)
+    return rounds
+
+
 def test_sac_end_to_end(runs, irl):
     artefact = made(runs, irl(*SAC, *common(runs), "--name", "moved"))
     parameters = artefact.manifest.record.parameters["transfer"]
@@ -66,26 +79,17 @@ def test_sac_end_to_end(runs, irl):
     assert again.out.startswith("HIT")
 
 
-def test_sac_killed_and_run_again_gives_the_same_bytes(runs, tmp_path):
-    """Killed by SIGINT it writes a checkpoint, replay buffer included, from which it resumes."""
-    longer = ["--set", "transfer.total_steps=20480"]
-    command = [sys.executable, "-m", "irlcli", *SAC, *longer, "--profile", "smoke"]
-    whole = tmp_path / "whole"
-    shutil.copytree(runs, whole, symlinks=True)
-    subprocess.run([*command, "--store", whole], check=True, capture_output=True)
-    process = subprocess.Popen(
-        [*command, "--store", runs], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    for line in process.stderr:
-        if "steps" in line and "/" in line:
-            process.send_signal(signal.SIGINT)
-            break
-    process.communicate()
-    assert process.returncode == 130
-    done = subprocess.run([*command, "--store", runs], check=True, capture_output=True, text=True)
-    resumed = Store(runs).resolve(done.stdout.strip().rpartition("/")[2]).artefact
+def test_sac_interrupted_and_run_again_gives_the_same_bytes(runs, irl, tmp_path, monkeypatch):
+    """By SIGINT. The checkpoint from which it resumes has the replay buffer, too."""
+    line = [*SAC, "--set", "transfer.total_steps=3072"]
+    whole = shutil.copytree(runs, tmp_path / "whole", symlinks=True)
+    expected = made(whole, irl(*line, *common(whole)))
+    rounds = interrupt(SACTrainer, 2, monkeypatch)
+    assert irl(*line, *common(runs)).code == 130
+    resumed = made(runs, irl(*line, *common(runs)))
+    assert rounds == [0, 1, 2]
     assert resumed.provenance()["resumed"] == 1
-    assert resumed.id in Store(whole).ids()
+    assert resumed.id == expected.id
 
 
 @pytest.mark.parametrize("words", [["--start", "student"], ["--start", "student", "--seed", "3"]])
@@ -245,21 +249,14 @@ def test_sac_restarts(runs, irl):
 
 def test_restarts_interrupted_and_run_again_give_the_same_bytes(runs, irl, tmp_path, monkeypatch):
     """Interrupted in its second restart, of two rounds, it resumes there."""
-    line = [*RESTARTS, "--set", "transfer.total_steps=4096"]
+    line = [*RESTARTS[:-1], "transfer.restarts=2", "--set", "transfer.total_steps=2048"]
+    line += ["--set", "transfer.ppo.rollouts_per_round=1"]
     whole = shutil.copytree(runs, tmp_path / "whole", symlinks=True)
     expected = made(whole, irl(*line, *common(whole)))
-    original, rounds = PPOTrainer.train_round, []
-
-    def interrupted(self, index, source):
-        rounds.append(index)
-        if len(rounds) == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-        return original(self, index, source)
-
-    monkeypatch.setattr(PPOTrainer, "train_round", interrupted)
+    rounds = interrupt(PPOTrainer, 3, monkeypatch)
     assert irl(*line, *common(runs)).code == 130
     resumed = made(runs, irl(*line, *common(runs)))
-    assert rounds == [0, 1, 0, 1, 0, 1]
+    assert rounds == [0, 1, 0, 1]
     assert resumed.provenance()["resumed"] == 1
     assert resumed.id == expected.id
 
