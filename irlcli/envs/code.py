@@ -1,4 +1,4 @@
-"""Which code defines an environment: found, digested and dated without importing it.
+"""Which code defines an environment: its files, their digest and its version; nothing is imported.
 
 An installed package is known by its distribution's version. Anything else is known by its content,
 so that an edit changes every key.
@@ -63,11 +63,11 @@ def _origin(module: str, directory: Path | None, where: str) -> Path:
     """The file of ``module``."""
     importlib.invalidate_caches()
     top, *inner = module.split(".")
-    hint = "install it, add its directory to PYTHONPATH, or "
+    hint = "install it, or add its directory to PYTHONPATH"
     if directory is None:
-        hint += "name the environment's TOML file, which lies beside it: --env, in Python env="
+        hint += ". Or name the TOML file beside it: --env, in Python env="
     else:
-        hint += f"put {top}.py beside the TOML file"
+        hint += f", or put {top}.py beside the TOML file"
     try:
         spec = importlib.util.find_spec(top)
         for depth in range(len(inner)):
@@ -116,14 +116,19 @@ def _sources(root: Path, module: str, where: str) -> list[Path]:
     pending = [module]
     while pending:
         name = pending.pop()
-        file, package = root / f"{name}.py", root / name
-        own = sorted(package.rglob("*.py")) if package.is_dir() else []
-        own = own or ([file] if file.is_file() else [])
-        for path in own:
+        for path in _files(root, name):
             if path not in found:
                 found[path] = None
                 pending += _imported(path, where)
     return list(found)
+
+
+def _files(root: Path, name: str) -> list[Path]:
+    """The Python files of ``name`` in ``root``: ``name.py`` precedes a folder without __init__.py."""
+    file, folder = root / f"{name}.py", root / name
+    if file.is_file() and not (folder / "__init__.py").is_file():
+        return [file]
+    return sorted(folder.rglob("*.py")) if folder.is_dir() else []
 
 
 def _imported(path: Path, where: str) -> list[str]:

@@ -128,6 +128,21 @@ def test_every_python_file_of_a_package_is_its_code(lab):
     assert digest(lab, "lab_parts") != before
 
 
+@pytest.mark.parametrize("name", ["lab_env", "lab_physics"])
+def test_a_module_precedes_a_folder_of_its_name_as_in_python(lab, name):
+    (lab / name).mkdir()
+    (lab / name / "data.py").write_text("")
+    before = digest(lab)
+    (lab / name / "data.py").write_text("ignored = 1\n")
+    assert digest(lab) == before
+    (lab / f"{name}.py").write_text("edited = 1\n")
+    assert digest(lab) != before
+    (lab / name / "__init__.py").write_text("")
+    package = digest(lab)
+    (lab / f"{name}.py").write_text("ignored = 1\n")
+    assert digest(lab) == package
+
+
 @pytest.mark.parametrize("module", ["nothing", "lab_env.inner", "lab_parts.leg", "os.nothing"])
 def test_a_module_that_does_not_exist(lab, module):
     with pytest.raises(IrlError, match=f"no module '{module}'") as caught:
