@@ -63,7 +63,8 @@ class Adapted(gymnasium.Wrapper):
         return self._seen(observation, "step"), reward, terminated, truncated, info
 
     def _seen(self, observation: Any, method: str) -> np.ndarray:
-        flat = np.asarray(observation, dtype=np.float32).reshape(-1)
+        # A copy: the environment may return one array in every step.
+        flat = np.array(observation, dtype=np.float32).reshape(-1)
         if flat.shape != self.observation_space.shape:
             raise self._wrong(
                 method,

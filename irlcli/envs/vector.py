@@ -94,7 +94,8 @@ class VectorWorlds:
                 ended.append(
                     Ended(
                         i,
-                        np.asarray(observation, dtype=np.float32),
+                        # A copy: reset() may write to the same array.
+                        np.array(observation, dtype=np.float32),
                         bool(terminated),
                         float(self._returns[i]),
                         int(self._lengths[i]),

@@ -96,7 +96,8 @@ class RewardVecEnvWrapper(VecEnvWrapper):
 
 
 def _flat(observation: Any) -> np.ndarray:
-    return np.asarray(observation, dtype=np.float32).reshape(-1)
+    # A copy: the environment may return one array in every step.
+    return np.array(observation, dtype=np.float32).reshape(-1)
 
 
 def _vectors(actions: np.ndarray, space: gymnasium.Space) -> np.ndarray:

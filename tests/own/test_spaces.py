@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import gymnasium
+import numpy as np
 import pytest
 
+import irlcli
 from irlcli.data.demonstrations import read_demonstrations
+from irlcli.envs.adapted import Adapted
+from irlcli.envs.vector import VectorWorlds
 from irlcli.store import Store
 
 RANDOM = ("evaluate", "--random", "--env", "cart.toml", "--profile", "smoke", "--quiet")
@@ -60,6 +65,44 @@ def test_what_an_environment_does_wrong_is_named_as_its_own(bench, old, new, nam
         done = bench.irl(*COLLECT, *ONE, "--workers", workers)
         error = done.err.splitlines()[0]
         assert done.code == 1 and "cart: " in error and named in error, done.err
+
+
+class Counter(gymnasium.Env):
+    """Returns one array in every step, which counts the steps."""
+
+    observation_space = gymnasium.spaces.Box(-10.0, 10.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    info = {}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seen = np.zeros(1, np.float32) if not hasattr(self, "seen") else self.seen
+        self.seen[:] = 0
+        return self.seen, {}
+
+    def step(self, action):
+        self.seen += 1
+        return self.seen, 0.0, False, False, self.info
+
+
+def test_an_observation_keeps_its_numbers_in_the_steps_that_follow():
+    world = Adapted(Counter(), "counter")
+    seen = [world.reset(seed=0)[0]] + [world.step(np.zeros(1, np.float32))[0] for _ in range(2)]
+    assert np.concatenate(seen).tolist() == [0, 1, 2]
+
+
+def test_a_final_observation_is_not_that_of_the_next_episode():
+    worlds = VectorWorlds([Counter()], max_episode_steps=2)
+    worlds.reset([0])
+    worlds.step(np.zeros((1, 1)))
+    _, _, (end,) = worlds.step(np.zeros((1, 1)))
+    assert end.final_observation.tolist() == [2]
+
+
+def test_a_reward_wrapper_sees_both_ends_of_a_step():
+    world = irlcli.RewardWrapper(Counter(), lambda obs, act, next_obs, done: (next_obs - obs)[:, 0])
+    world.reset(seed=0)
+    assert [world.step(np.zeros(1, np.float32))[1] for _ in range(2)] == [1.0, 1.0]
 
 
 def test_flat_observations_and_actions_of_any_shape(bench):
