@@ -1,7 +1,7 @@
 """An environment from outside the package, as policies and learners here see it.
 
 Observations become vectors [D] float32, continuous actions vectors [A], several indices a vector [K],
-and the first discrete action is 0. What the environment itself does wrong is reported as its own mistake.
+and the first discrete action is 0. Mistakes in the environment's own code are reported as such.
 """
 
 from __future__ import annotations
@@ -35,9 +35,7 @@ class Adapted(gymnasium.Wrapper):
         self._name = name
         self.observation_space = _flat_observations(env.observation_space, name)
         self.action_space = _flat_actions(env.action_space, name)
-        self._shape = env.action_space.shape or ()
-        self._dtype = env.action_space.dtype
-        self._start = getattr(env.action_space, "start", 0)
+        self._actions: Any = env.action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         try:
@@ -47,20 +45,24 @@ class Adapted(gymnasium.Wrapper):
         return self._seen(observation, "reset"), info
 
     def step(self, action: Any) -> Any:
-        if isinstance(self.action_space, Box):
-            action = np.asarray(action, np.float32).reshape(self._shape)
-        elif isinstance(self.action_space, MultiDiscrete):
-            action = np.asarray(action, self._dtype).reshape(self._shape) + self._start
-        else:
-            action = action + self._start
         try:
-            observation, reward, terminated, truncated, info = self.env.step(action)
+            observation, reward, terminated, truncated, info = self.env.step(self._taken(action))
             reward = float(reward)
         except Exception as error:
             raise self._failed("step", error) from error
         if not math.isfinite(reward):
             raise self._wrong("step", f"returned the reward {reward}")
         return self._seen(observation, "step"), reward, terminated, truncated, info
+
+    def _taken(self, action: Any) -> Any:
+        """``action`` as the environment takes it: of its type, within its bounds, and a copy."""
+        space = self._actions
+        if isinstance(space, Discrete):
+            return action + space.start
+        action = np.asarray(action, space.dtype).reshape(space.shape)
+        if isinstance(space, MultiDiscrete):
+            return action + space.start
+        return np.clip(action, space.low, space.high)
 
     def _seen(self, observation: Any, method: str) -> np.ndarray:
         # A copy: the environment may return one array in every step.
@@ -111,6 +113,11 @@ def _flat_actions(space: gymnasium.Space, name: str) -> Box | Discrete | MultiDi
             f"{name} has actions in {type(space).__name__}, but only Box, Discrete and "
             "MultiDiscrete are supported",
             "wrap the environment so that its actions are one of these",
+        )
+    if space.dtype.kind != "f":
+        raise UsageError(
+            f"{name} has actions in a Box of {space.dtype}, but only a Box of floats is supported",
+            "use MultiDiscrete for whole numbers",
         )
     low, high = (b.reshape(-1).astype(np.float32) for b in (space.low, space.high))
     if not low.size or not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():

@@ -27,6 +27,8 @@ from irlcli.errors import NotFound, UsageError, of_types, suggest
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,39}"
 _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _MAX_NUMBER = 1e300
+# Version of how such environments are stepped (irlcli.envs.adapted); part of every key.
+_PHYSICS = 2
 _Number = Annotated[float, Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
 
@@ -110,6 +112,7 @@ def from_document(
         max_episode_steps=env.max_episode_steps or 1,
         knobs={knob: k.described(knob) for knob, k in knobs.items()},
         discrete_actions=env.actions == "discrete",
+        physics=_PHYSICS,
         own=Own(
             id=env.id,
             arguments=env.arguments,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import gymnasium
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ FORCE = "float(np.clip(action, -1.0, 1.0)[0])"
         (OBSERVATIONS, f"{SPACES}Box(0, 1, (64, 65))", "of 4160 numbers"),
         (ACTIONS, f"{SPACES}MultiBinary(3)", "in MultiBinary"),
         (ACTIONS, f"{SPACES}Box(-np.inf, np.inf, (1,))", "without finite bounds"),
+        (ACTIONS, f"{SPACES}Box(0, 3, (1,), np.int64)", "in a Box of int64"),
         (ACTIONS, f"{SPACES}Discrete(3)", "are discrete, not as env.actions says"),
         ("mass_scale=1.0", "weight=1.0", "keyword argument 'mass_scale'"),
         ("import numpy as np", "import numpy as np\nimport nothing_here", "'nothing_here'"),
@@ -72,7 +75,7 @@ class Counter(gymnasium.Env):
 
     observation_space = gymnasium.spaces.Box(-10.0, 10.0, (1,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
-    info = {}
+    info: ClassVar = {}
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -103,6 +106,35 @@ def test_a_reward_wrapper_sees_both_ends_of_a_step():
     world = irlcli.RewardWrapper(Counter(), lambda obs, act, next_obs, done: (next_obs - obs)[:, 0])
     world.reset(seed=0)
     assert [world.step(np.zeros(1, np.float32))[1] for _ in range(2)] == [1.0, 1.0]
+
+
+def test_an_action_has_the_type_and_the_bounds_of_its_space():
+    class Exact(Counter):
+        action_space = gymnasium.spaces.Box(-0.1, 0.1, (1, 2), np.float64)
+
+        def step(self, action):
+            assert self.action_space.contains(action)
+            self.taken = action
+            return super().step(action)
+
+    exact = Exact()
+    world = Adapted(exact, "exact")
+    world.reset(seed=0)
+    world.step(world.action_space.high)
+    world.step(np.array([-3.0, 0.05], np.float32))
+    assert exact.taken.tolist() == [[-0.1, pytest.approx(0.05)]]
+
+
+def test_an_environment_cannot_change_the_action_of_its_caller():
+    class Scaling(Counter):
+        def step(self, action):
+            action *= 0.5
+            return super().step(action)
+
+    world, action = Adapted(Scaling(), "scaling"), np.ones(1, np.float32)
+    world.reset(seed=0)
+    world.step(action)
+    assert action.tolist() == [1.0]
 
 
 def test_flat_observations_and_actions_of_any_shape(bench):
