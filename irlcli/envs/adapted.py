@@ -7,6 +7,7 @@ and the first discrete action is 0. Mistakes in the environment's own code are r
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Any
 
 import gymnasium
@@ -40,7 +41,7 @@ class Adapted(gymnasium.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         try:
             observation, info = self.env.reset(seed=seed, options=options)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._failed("reset", error) from error
         return self._seen(observation, "reset"), info
 
@@ -48,11 +49,12 @@ class Adapted(gymnasium.Wrapper):
         try:
             observation, reward, terminated, truncated, info = self.env.step(self._taken(action))
             reward = float(reward)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._failed("step", error) from error
         if not math.isfinite(reward):
             raise self._wrong("step", f"returned the reward {reward}")
-        return self._seen(observation, "step"), reward, terminated, truncated, info
+        ends = self._flag("terminated", terminated), self._flag("truncated", truncated)
+        return self._seen(observation, "step"), reward, *ends, self._reported(info)
 
     def _taken(self, action: Any) -> Any:
         """``action`` as the environment takes it: of its type, within its bounds, and a copy."""
@@ -65,8 +67,11 @@ class Adapted(gymnasium.Wrapper):
         return np.clip(action, space.low, space.high)
 
     def _seen(self, observation: Any, method: str) -> np.ndarray:
-        # A copy: the environment may return one array in every step.
-        flat = np.array(observation, dtype=np.float32).reshape(-1)
+        try:
+            # A copy: the environment may return one array in every step.
+            flat = np.array(observation, dtype=np.float32).reshape(-1)
+        except (TypeError, ValueError) as error:
+            raise self._wrong(method, "returned an observation that is no array") from error
         if flat.shape != self.observation_space.shape:
             raise self._wrong(
                 method,
@@ -77,7 +82,23 @@ class Adapted(gymnasium.Wrapper):
             raise self._wrong(method, "returned an observation that is not finite")
         return flat
 
-    def _failed(self, method: str, error: Exception) -> StageFailed:
+    def _flag(self, name: str, value: Any) -> bool:
+        if np.size(value) != 1:
+            raise self._wrong("step", f"returned a {name} that is not true or false")
+        return bool(value)
+
+    def _reported(self, info: Any) -> dict[str, Any]:
+        """``info`` with a finite number as progress, if any, and text as error, if any."""
+        if not isinstance(info, dict):
+            raise self._wrong("step", "returned an info that is no dictionary")
+        progress, error = info.get("progress", 0.0), info.get("error")
+        if not (isinstance(progress, Real) and math.isfinite(progress)):
+            raise self._wrong("step", 'returned an info["progress"] that is not a finite number')
+        text = None if error is None or error is False else str(error)
+        found = info | {"error": text}
+        return found | {"progress": float(progress)} if "progress" in info else found
+
+    def _failed(self, method: str, error: BaseException) -> StageFailed:
         text = (str(error) or "no message").splitlines()[0]
         return self._wrong(method, f"raised {type(error).__name__}: {text}")
 

@@ -81,7 +81,7 @@ def _plain(text: str) -> str:
     )
 
 
-def _line(error: Exception) -> str:
+def _line(error: BaseException) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]
 
 
@@ -120,7 +120,7 @@ def _check_env(spec: EnvironmentSpec) -> None:
             inner = inner.env
         try:
             check_env(inner, skip_render_check=True)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             # It asserts, and an environment can raise anything.
             raise _Wrong(_plain(_line(error))) from error
 

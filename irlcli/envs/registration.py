@@ -159,7 +159,7 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
         raise UsageError(
             f"{own.source}: env.id: {_line(error)}", "is the id registered?"
         ) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         given = ", ".join(f"{name}={value!r}" for name, value in keywords.items())
         raise UsageError(
             f"{where} cannot be made{f' with {given}' if given else ''}: "
@@ -185,7 +185,7 @@ def _import(spec: EnvironmentSpec, own: Own) -> None:
         )
 
 
-def _line(error: Exception) -> str:
+def _line(error: BaseException) -> str:
     return (str(error) or "no message").splitlines()[0][:300]
 
 

@@ -21,6 +21,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from multiprocessing.sharedctypes import RawArray
 from typing import Any, NamedTuple
 
@@ -57,9 +58,11 @@ class _Channel(NamedTuple):
     outgoing: Connection
 
     def send(self, message: Any) -> None:
-        os.write(self.outgoing.fileno(), _PLAIN if message is None else _PICKLED)
-        if message is not None:
-            self.outgoing.send(message)
+        # Before the first byte: what cannot be pickled must not leave half a message.
+        pickled = None if message is None else ForkingPickler.dumps(message)
+        os.write(self.outgoing.fileno(), _PLAIN if pickled is None else _PICKLED)
+        if pickled is not None:
+            self.outgoing.send_bytes(pickled)
 
     def receive(self) -> Any:
         byte = os.read(self.incoming.fileno(), 1)

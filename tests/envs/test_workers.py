@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -16,7 +18,7 @@ import pytest
 from mujoco_robots import HalfCheetah
 
 from irlcli.envs.vector import VectorWorlds
-from irlcli.envs.workers import WorkerFailed, WorkerWorlds
+from irlcli.envs.workers import WorkerFailed, WorkerWorlds, _Channel
 from irlcli.errors import StageFailed
 
 SEEDS = [3, 1, 4]
@@ -140,6 +142,17 @@ def test_the_hint_of_an_environments_error_is_kept():
         worlds.step(np.zeros(2, dtype=np.int64))
     assert failed.value.message == "worker 0 (world 0): it has no floor"
     assert failed.value.hint == "give it a floor"
+
+
+def test_what_cannot_be_pickled_leaves_no_half_message():
+    incoming, outgoing = multiprocessing.Pipe(False)
+    channel = _Channel(incoming, outgoing)
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        channel.send(lambda: None)
+    assert not incoming.poll()
+    channel.send([3])
+    assert channel.receive() == [3]
+    channel.close()
 
 
 def test_a_dead_worker_is_reported_and_the_others_are_ended():

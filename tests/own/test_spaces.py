@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import ClassVar
 
 import gymnasium
@@ -12,6 +13,7 @@ import irlcli
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs.adapted import Adapted
 from irlcli.envs.vector import VectorWorlds
+from irlcli.errors import StageFailed
 from irlcli.store import Store
 
 RANDOM = ("evaluate", "--random", "--env", "cart.toml", "--profile", "smoke", "--quiet")
@@ -137,6 +139,53 @@ def test_an_environment_cannot_change_the_action_of_its_caller():
     assert action.tolist() == [1.0]
 
 
+@pytest.mark.parametrize(
+    ("returned", "named"),
+    [
+        (("text", 0.0, False, False, {}), "an observation that is no array"),
+        (({"a": 1}, 0.0, False, False, {}), "an observation that is no array"),
+        (([[1, 2], [3]], 0.0, False, False, {}), "an observation that is no array"),
+        (([1], 0.0, [False, True], False, {}), "a terminated that is not true or false"),
+        (([1], 0.0, False, [False, True], {}), "a truncated that is not true or false"),
+        (([1], 0.0, False, False, None), "an info that is no dictionary"),
+        (([1], 0.0, False, False, {"progress": None}), "is not a finite number"),
+        (([1], 0.0, False, False, {"progress": np.inf}), "is not a finite number"),
+        (([1], 0.0, False, False, {"progress": np.ones(2)}), "is not a finite number"),
+    ],
+)
+def test_what_a_step_returns_is_checked_at_once(returned, named):
+    class Odd(Counter):
+        def step(self, action):
+            return returned
+
+    world = Adapted(Odd(), "odd")
+    world.reset(seed=0)
+    with pytest.raises(StageFailed, match=re.escape(named)) as caught:
+        world.step(np.zeros(1))
+    assert caught.value.message.startswith("odd: step() returned")
+
+
+def test_an_environment_that_exits_is_named():
+    class Exiting(Counter):
+        def step(self, action):
+            raise SystemExit(3)
+
+    world = Adapted(Exiting(), "exiting")
+    world.reset(seed=0)
+    with pytest.raises(StageFailed, match="exiting: step\\(\\) raised SystemExit: 3"):
+        world.step(np.zeros(1))
+
+
+def test_a_progress_is_a_number_and_an_error_is_text():
+    class Telling(Counter):
+        info: ClassVar = {"progress": np.float32(0.5), "error": ValueError("fell"), "other": 1}
+
+    world = Adapted(Telling(), "telling")
+    world.reset(seed=0)
+    info = world.step(np.zeros(1))[-1]
+    assert info == {"progress": 0.5, "error": "fell", "other": 1}
+
+
 def test_flat_observations_and_actions_of_any_shape(bench):
     bench.edit(bench.module, OBSERVATIONS, f"{SPACES}Box(-10, 10, (2, 1), np.float64)")
     bench.edit(bench.module, RETURNED, "return np.array([[self.position], [self.speed]])")
@@ -186,6 +235,14 @@ def test_the_example_passes_every_check(bench):
         ),
         ("mass_scale=1.0", "mass_scale_=1.0", "mass: its bounds can be made", "mass_scale"),
         ("self.drag = drag", "raise ValueError('broken')", "it can be made", "broken"),
+        ("self.drag = drag", "raise SystemExit(3)", "it can be made", "SystemExit"),
+        (
+            "reward = 1.0",
+            "raise SystemExit(3)\n        reward = 1.0",
+            "it can be made",
+            "SystemExit",
+        ),
+        (RETURNED, "return 'text'", "it can be made", "no array"),
     ],
 )
 def test_checks_find_what_is_wrong(bench, old, new, failed, named):
