@@ -181,6 +181,10 @@ class Check:
         Raises:
             UsageError: naming the first step that cannot be used, and why.
         """
+        # Of a part beyond the time limit nothing is left.
+        yield from (part for part in self._each(parts) if len(part))
+
+    def _each(self, parts: Iterable[Steps]) -> Iterator[Steps]:
         before: Steps | None = None
         for part in parts:
             if len(part) == 0:
@@ -279,8 +283,8 @@ class Check:
         _refuse(
             steps,
             goes_on & ended,
-            "the episode goes on after its end",
-            "a new episode needs another number in the column episode",
+            "the episode has steps after its end",
+            "a terminated or truncated step is the last of its episode",
         )
         settings = np.append(self._setting, steps.settings[:-1])
         _refuse(

@@ -211,7 +211,7 @@ def changed(column, row, value):
         (changed("setting", 4, "mass=1x"), 4, "setting 'mass=1x' is not one of"),
         (changed("setting", 4, None), 4, "setting is missing"),
         (changed("setting", 5, "bounce=0.1"), 5, "the setting changes within an episode"),
-        (changed("terminated", 4, True), 5, "the episode goes on after its end"),
+        (changed("terminated", 4, True), 5, "the episode has steps after its end"),
         (changed("obs", 5, [9.0, 9.0, 9.0]), 5, "obs differs from next_obs"),
         (changed("episode", 8, 0), 8, "episode 0 begins again"),
         (changed("episode", 2, None), 2, "episode is missing"),
@@ -241,6 +241,33 @@ def test_a_row_that_cannot_be_used_is_named(tmp_path, change, row, message):
     assert message in caught.value.message and caught.value.hint
     if row is not None:
         assert f"a.parquet row {row}: " in caught.value.message
+
+
+def test_an_episode_column_of_lists_is_named(tmp_path):
+    made = table([episode(np.random.default_rng(0), 3)], TEXTS[:1])
+    made = made.set_column(made.schema.get_field_index("episode"), "episode", pa.array([[0]] * 3))
+    pq.write_table(made, tmp_path / "a.parquet")
+    with pytest.raises(UsageError, match="row 0: episode is a list"):
+        imported(tmp_path / "out", tmp_path / "a.parquet", texts=TEXTS[:1])
+
+
+def test_seeds_that_a_dataset_cannot_hold_are_unknown(tmp_path):
+    made = table([episode(np.random.default_rng(0), 1) for _ in range(3)], TEXTS[:1])
+    seeds = pa.array([5, 2**63 - 1, 2**63], pa.uint64())
+    made = made.set_column(made.schema.get_field_index("seed"), "seed", seeds)
+    pq.write_table(made, tmp_path / "a.parquet")
+    found, _, _ = imported(tmp_path / "out", tmp_path / "a.parquet", texts=TEXTS[:1])
+    assert [t.seed for t in found.trajectories[TEXTS[0]]] == [5, 2**63 - 1, -1]
+
+
+@pytest.mark.parametrize("read", [1, 7, HORIZON])
+def test_a_last_batch_of_steps_that_are_cut_leaves_nothing(tmp_path, read):
+    made = [episode(np.random.default_rng(0), n) for n in (3, HORIZON + 9)]
+    pq.write_table(table(made, TEXTS[:1]), tmp_path / "a.parquet")
+    _, written, irregular = imported(
+        tmp_path / "out", tmp_path / "a.parquet", cut=True, read=read, write=1, texts=TEXTS[:1]
+    )
+    assert written.lengths.tolist() == [3, HORIZON] and irregular.long == 1
 
 
 def test_other_observations_and_actions_than_the_environments_are_refused(tmp_path):

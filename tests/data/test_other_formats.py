@@ -140,6 +140,25 @@ def test_an_episode_of_imitation_that_cannot_be_used_is_named(tmp_path, change, 
     assert "episode 1" in caught.value.message and message in caught.value.message
 
 
+@pytest.mark.parametrize(
+    ("terminal", "message"),
+    [
+        ([True, None], "episode 1: terminal is missing"),
+        ([[True], [True]], "terminal is not true or false"),
+        ([1.0, 0.0], "terminal is not true or false"),
+    ],
+)
+def test_what_is_no_end_of_an_episode_is_named(tmp_path, terminal, message):
+    rng = np.random.default_rng(0)
+    made = [
+        episode(rng, 3) | {"terminal": terminal[0]},
+        episode(rng, 0) | {"terminal": terminal[1]},
+    ]
+    save_imitation(tmp_path / "a", made)
+    with pytest.raises(UsageError, match=message):
+        imported(read_imitation, tmp_path / "a", tmp_path / "out", cut=True)
+
+
 @pytest.mark.parametrize("damage", ["truncated", "text", "outside", "none", "stateless"])
 def test_a_damaged_directory_of_imitation_is_refused(tmp_path, damage):
     rng = np.random.default_rng(0)
@@ -243,6 +262,39 @@ def test_an_episode_of_another_form_is_named(tmp_path):
         file["episode_2"]["observations"] = [b"text"] * 4
     with pytest.raises(IntegrityError, match="not rows of numbers"):
         imported(read_minari, tmp_path / "a", tmp_path / "again")
+
+
+@pytest.mark.parametrize(
+    ("seed", "kept"),
+    [
+        (np.uint64(7), 7),
+        (np.uint64(2**63 + 5), -1),
+        (-3, -1),
+        ("None", -1),
+        (np.nan, -1),
+        ([1, 2], -1),
+    ],
+)
+def test_a_seed_that_a_dataset_cannot_hold_is_unknown(tmp_path, seed, kept):
+    import h5py
+
+    save_minari(tmp_path / "a", [episode(np.random.default_rng(0), 3)])
+    with h5py.File(tmp_path / "a" / "main_data.hdf5", "a") as file:
+        file["episode_0"].attrs["seed"] = seed
+    ((only,),) = imported(read_minari, tmp_path / "a", tmp_path / "out").values()
+    assert only.seed == kept
+
+
+@pytest.mark.parametrize("name", ["rewards", "terminations", "truncations"])
+def test_several_numbers_in_a_step_are_refused(tmp_path, name):
+    import h5py
+
+    save_minari(tmp_path / "a", [episode(np.random.default_rng(0), 3)])
+    with h5py.File(tmp_path / "a" / "main_data.hdf5", "a") as file:
+        del file["episode_0"][name]
+        file["episode_0"][name] = np.zeros((3, 1))
+    with pytest.raises(UsageError, match=f"episode 0: {name} are of shape"):
+        imported(read_minari, tmp_path / "a", tmp_path / "out")
 
 
 def test_no_environment_is_made_to_find_the_spaces(tmp_path):

@@ -107,6 +107,15 @@ def _lengths(directory: Path, batch: pa.RecordBatch, done: int, expected: Expect
     return lengths
 
 
+def _terminal(directory: Path, column: pa.Array, done: int) -> np.ndarray:
+    """Whether each episode [R] ended."""
+    if not pa.types.is_boolean(column.type):
+        raise UsageError(
+            f"{directory}: terminal is not true or false in each episode", "save it again"
+        )
+    return numbers(column, "terminal", lambda row: f"{directory} episode {done + row}")
+
+
 def _steps(
     directory: Path, batch: pa.RecordBatch, lengths: np.ndarray, done: int, expected: Expected
 ) -> Steps:
@@ -126,9 +135,9 @@ def _steps(
         return f"{directory} episode {done + shown[row]}, observation {at[row]}"
 
     observations = vectors(numbers(batch.column("obs").flatten(), "obs", place_of_observation))
-    terminal = numbers(batch.column("terminal"), "terminal", lambda row: place(int(starts[row])))
+    terminal = _terminal(directory, batch.column("terminal"), done)
     last = t == lengths[episode] - 1
-    ended = last & terminal.astype(bool)[episode]
+    ended = last & terminal[episode]
     at_limit = lengths[episode] == expected.horizon
     rewards = None
     if "rews" in batch.schema.names:

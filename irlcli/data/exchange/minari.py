@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,6 +60,12 @@ def read_minari(directory: Path, expected: Expected, size: int = PIECE) -> Itera
         if lengths[1] == 0:
             expected.irregular.found_empty(place)
             continue
+        for name, array in zip(_ARRAYS[2:], episode[2:5], strict=True):
+            if array.ndim != 1:
+                raise UsageError(
+                    f"{place}: {name} are of shape {array.shape}, not ({len(array)},)",
+                    "every step has one number in each",
+                )
         if lengths[0] != lengths[1] + 1 or len(set(lengths[1:])) > 1:
             raise UsageError(
                 f"{place} has {lengths[0]} observations, {lengths[1]} actions and {lengths[2]} "
@@ -88,8 +95,7 @@ def _steps(directory: Path, episodes: Mapping[int, _Episode], expected: Expected
     settings, seeds = [], []
     for number, episode in episodes.items():
         settings.append(_setting(episode.metadata, expected, f"{directory} episode {number}"))
-        seed = episode.metadata.get("seed")
-        seeds.append(-1 if seed is None else int(seed))
+        seeds.append(_seed(episode.metadata.get("seed")))
     first = np.zeros(int(lengths.sum()), dtype=bool)
     first[starts] = True
     actions = action_array(np.concatenate([e.actions for e in found]))
@@ -102,9 +108,15 @@ def _steps(directory: Path, episodes: Mapping[int, _Episode], expected: Expected
         next_observations=vectors(np.concatenate([e.observations[1:] for e in found])),
         terminated=np.concatenate([e.terminations for e in found]).astype(bool),
         truncated=np.concatenate([e.truncations for e in found]).astype(bool),
-        seeds=np.repeat(seeds, lengths),
+        seeds=np.repeat(np.array(seeds, np.int64), lengths),
         place=place,
     )
+
+
+def _seed(found: Any) -> int:
+    """An episode's seed; -1 if it is no whole number that int64 holds. Minari draws 64 bits."""
+    whole = isinstance(found, Integral) and 0 <= found <= np.iinfo(np.int64).max
+    return int(found) if whole else -1
 
 
 def _setting(metadata: Mapping[str, Any], expected: Expected, place: str) -> int:

@@ -93,11 +93,13 @@ def _steps(
         if rewards.shape[1] != 1:
             raise UsageError(f"{place(0)}: reward is a list", "a step has one reward")
         rewards = rewards[:, 0].astype(np.float64)
-    seeds = np.full(batch.num_rows, -1)
+    seeds = np.full(batch.num_rows, -1, np.int64)
     if "seed" in batch.schema.names:
         if not pa.types.is_integer(batch.schema.field("seed").type):
             raise UsageError(f"{place(0)}: seed is not a whole number", "write whole numbers")
-        seeds = column("seed").astype(np.int64)
+        found = column("seed")
+        known = (found >= 0) & (found <= np.iinfo(np.int64).max)
+        seeds[known] = found[known]
     return Steps(
         first=episodes.of(named, terminated | truncated, place),
         settings=_settings(batch, expected, place),
@@ -157,6 +159,8 @@ class _EpisodeStarts:
             first = np.append(self._ended, ended[:-1])
             self._ended = bool(ended[-1])
             return first
+        if pa.types.is_nested(named.type):
+            raise UsageError(f"{place(0)}: episode is a list", "write a number or text")
         require_all(named, "episode", place)
         changes = pc.indices_nonzero(pc.not_equal(named[1:], named[:-1])).to_numpy() + 1
         first = np.zeros(len(named), dtype=bool)
