@@ -297,7 +297,7 @@ def parse_setting(env: str, text: str) -> Setting:
 
     Raises:
         UsageError: as :func:`parse_settings`; more than one value of a knob; or knobs that set
-            the same argument.
+            the same argument, or add the same to the observation.
     """
     if text == "default":
         environment(env)
@@ -312,14 +312,21 @@ def parse_setting(env: str, text: str) -> Setting:
         return settings[0]
     changes = sorted(change for part in parts for change in parse_settings(env, part)[0].changes)
     arguments: dict[str, str] = {}
+    added: dict[str, str] = {}
     for knob, _ in changes:
-        argument = knob_of(env, knob).argument
+        spec = knob_of(env, knob)
+        argument = spec.argument
         if argument in arguments:
             both = f"{arguments[argument]} and {knob}" if arguments[argument] != knob else knob
             raise UsageError(
                 f"{text!r} changes {argument} twice, by {both}", "change each thing once"
             )
         arguments[argument] = knob
+        if spec.observed and added.setdefault(spec.observed, knob) != knob:
+            raise UsageError(
+                f"{text!r} adds {spec.observed} twice, by {added[spec.observed]} and {knob}",
+                "give one of them",
+            )
     setting = Setting(tuple(changes))
     if len(str(setting)) > MAX_SETTING_LENGTH:
         raise UsageError(

@@ -330,6 +330,13 @@ def test_a_bad_setting_of_several_knobs_is_refused(text, message):
     assert caught.value.hint
 
 
+@pytest.mark.parametrize("env", ["ant", "half-cheetah"])
+def test_two_goals_in_one_setting_are_refused(env):
+    with pytest.raises(UsageError, match="adds a goal twice, by direction and goal-y"):
+        parse_setting(env, "goal-y=0,direction=10")
+    assert parse_setting(env, "goal-y=0,mass=2x").knobs == ("goal-y", "mass")
+
+
 def test_settings_of_several_knobs_share_worlds_knob_by_knob():
     wide, narrow, beside = (
         parse_setting("ant", text)
