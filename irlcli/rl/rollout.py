@@ -136,4 +136,8 @@ def _random_actions(space: gymnasium.Space, count: int, rng: np.random.Generator
 
 
 def _idle_actions(space: gymnasium.Space, count: int) -> np.ndarray:
-    return np.zeros((count, *(space.shape or ())), dtype=_action_dtype(space))
+    """Zero, or where it is out of bounds the nearest bound; the first of several indices."""
+    zeros: np.ndarray = np.zeros((count, *(space.shape or ())), dtype=_action_dtype(space))
+    return (
+        np.clip(zeros, space.low, space.high) if isinstance(space, gymnasium.spaces.Box) else zeros
+    )

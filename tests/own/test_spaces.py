@@ -14,6 +14,7 @@ from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs.adapted import Adapted
 from irlcli.envs.vector import VectorWorlds
 from irlcli.errors import StageFailed
+from irlcli.rl.rollout import _idle_actions
 from irlcli.store import Store
 
 RANDOM = ("evaluate", "--random", "--env", "cart.toml", "--profile", "smoke", "--quiet")
@@ -125,6 +126,14 @@ def test_an_action_has_the_type_and_the_bounds_of_its_space():
     world.step(world.action_space.high)
     world.step(np.array([-3.0, 0.05], np.float32))
     assert exact.taken.tolist() == [[-0.1, pytest.approx(0.05)]]
+
+
+def test_the_idle_agent_stays_within_the_bounds():
+    space = gymnasium.spaces.Box(
+        np.array([1, -5, -1], np.float32), np.array([5, -2, 1], np.float32)
+    )
+    assert _idle_actions(space, 2).tolist() == [[1, -2, 0]] * 2
+    assert _idle_actions(gymnasium.spaces.Discrete(3), 2).tolist() == [0, 0]
 
 
 def test_an_environment_cannot_change_the_action_of_its_caller():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,7 +114,7 @@ def _steps(directory: Path, episodes: Mapping[int, _Episode], expected: Expected
 
 def _seed(found: Any) -> int:
     """An episode's seed; -1 if it is no whole number that int64 holds. Minari draws 64 bits."""
-    whole = isinstance(found, Integral) and 0 <= found <= np.iinfo(np.int64).max
+    whole = isinstance(found, int | np.integer) and 0 <= found <= np.iinfo(np.int64).max
     return int(found) if whole else -1
 
 
