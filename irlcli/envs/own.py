@@ -18,7 +18,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from irlcli.configs.load import PROFILES, read_toml
-from irlcli.configs.schema import Config, Count
+from irlcli.configs.schema import Config
 from irlcli.envs.code import code_of
 from irlcli.envs.registry import BUILT_IN
 from irlcli.envs.spec import Code, EnvironmentSpec, Form, Knob, Own
@@ -29,6 +29,8 @@ _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _MAX_NUMBER = 1e300
 # Version of how such environments are stepped (irlcli.envs.adapted); part of every key.
 _PHYSICS = 2
+# What the column ``t`` of demonstrations holds.
+_Steps = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 _Number = Annotated[float, Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
 
@@ -38,7 +40,7 @@ class _Env(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     id: str | None = None
     entry_point: str | None = None
     name: str | None = None
-    max_episode_steps: Count | None = None
+    max_episode_steps: _Steps | None = None
     actions: Literal["discrete", "continuous"] | None = None
     arguments: dict[str, Any] = {}
     files: tuple[str, ...] = ()
@@ -210,8 +212,14 @@ def _knob(name: str, value: Any) -> _Knob:
         )
     if not knob.low <= knob.high:
         raise UsageError(
-            f"knobs.{name}: low = {knob.low:g} is above high = {knob.high:g}", "exchange them"
+            f"knobs.{name}: low = {knob.low:g} is above high = {knob.high:g}", "swap them"
         )
+    for bound in ("low", "high"):
+        if knob.whole and not getattr(knob, bound).is_integer():
+            raise UsageError(
+                f"knobs.{name}: whole = true, but {bound} = {getattr(knob, bound):g}",
+                "write whole numbers as bounds",
+            )
     return knob
 
 

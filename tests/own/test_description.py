@@ -18,6 +18,14 @@ FILE = Path("/nowhere/hopper.toml")
 
 WORDS = st.from_regex(r"[A-Za-z][A-Za-z0-9_-]{0,10}", fullmatch=True)
 NUMBERS = st.floats(-1e6, 1e6)
+
+
+def _with_whole_bounds(knob):
+    if knob.get("whole"):
+        knob |= {"low": float(round(knob["low"])), "high": float(round(knob["high"]))}
+    return knob
+
+
 KNOB = st.fixed_dictionaries(
     {
         "argument": st.from_regex(r"[a-z][a-z_]{0,8}", fullmatch=True).filter(
@@ -34,7 +42,7 @@ KNOB = st.fixed_dictionaries(
         "whole": st.booleans(),
         "observed": st.booleans(),
     },
-)
+).map(_with_whole_bounds)
 DOCUMENT = st.fixed_dictionaries(
     {
         "env": st.fixed_dictionaries(
@@ -109,12 +117,20 @@ WRONG = [
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\narguments.a = nan', 2, "env.arguments.a", "num"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\narguments.drag = 1', 2, "knobs.drag", "omit"),
     ("max_episode_steps = 50", "max_episode_steps = 0", 2, "env.max_episode_steps", "own-"),
+    (
+        "max_episode_steps = 50",
+        "max_episode_steps = 2147483648",
+        2,
+        "env.max_episode_steps",
+        "own-",
+    ),
     ('actions = "continuous"', 'actions = "both"', 2, "env.actions", "own-environments"),
     ("[knobs.mass]", "[knobs.1mass]", 2, "'1mass'", "a letter first"),
     ('argument = "mass_scale"', "", 2, "knobs.mass.argument is missing", "[knobs.mass]"),
     ('argument = "mass_scale"', 'argument = "mass-scale"', 2, "'mass-scale'", "constructor"),
     ('forms = ["multiplier"]', 'forms = ["times"]', 2, "knobs.mass.forms", "own-environments"),
-    ("low = 0.1", "low = 11.0", 2, "low = 11 is above high = 10", "exchange"),
+    ("low = 0.1", "low = 11.0", 2, "low = 11 is above high = 10", "swap"),
+    ("low = 0.1", "low = 0.1\nwhole = true", 2, "knobs.mass: whole = true, but low = 0.1", "whole"),
     ("low = 0.1", "low = nan", 2, "knobs.mass.low", "own-environments"),
     ('id = ["1x", "2x"]', 'id = ["1x", "20x"]', 2, "mass='20x' is out of range", "0.1 to 10"),
     ("[interventions.mass]", "[interventions.wind]", 2, "no intervention 'wind'", "mass"),
