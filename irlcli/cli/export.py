@@ -5,13 +5,14 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from irlcli.cli import console as out
 from irlcli.cli.options import Ref, store_command
 from irlcli.cli.session import Session
+from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
 from irlcli.experiments.status import checked
@@ -48,10 +49,13 @@ def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
     directory = checked(session.store, source)
     with _new_file(Path(name)) as path:
         from irlcli.data.exchange.transitions import write_transitions
+        from irlcli.data.steps import shifted
         from irlcli.data.streaming import read_stream
 
         settings, steps = read_stream(directory)
-        write_transitions(path, env, settings, steps)
+        spec = environment(env)
+        start = _spaces(env, settings[0])[2] if spec.own and spec.discrete_actions else 0
+        write_transitions(path, env, settings, shifted(steps, start))
     return Path(name)
 
 
@@ -63,21 +67,31 @@ def _demos_to_minari(session: Session, ref: str, name: str) -> Path:
         raise UsageError(f"Minari has a dataset {name!r} already", "raise its version: -v1")
     dataset.parent.mkdir(parents=True, exist_ok=True)
     with _new_file(dataset) as path:
-        from contextlib import closing
-
         from irlcli.data.exchange.minari import declare_namespace, write_minari
+        from irlcli.data.steps import shifted
         from irlcli.data.streaming import read_stream
-        from irlcli.envs.registration import make
         from irlcli.interventions import parse_setting
 
         texts, steps = read_stream(directory)
+        *spaces, start = _spaces(env, texts[0])
         settings = [parse_setting(env, text) for text in texts]
-        with closing(make(env, settings[0])) as world:
-            spaces = world.observation_space, world.action_space
         path.mkdir()
-        write_minari(path / "data", name, env, settings, steps, spaces)
+        write_minari(path / "data", name, env, settings, shifted(steps, start), (*spaces,))
     declare_namespace(name)
     return dataset
+
+
+def _spaces(env: str, setting: str) -> tuple[Any, Any, Any]:
+    """The spaces of observations and actions as the environment counts them, and the first index."""
+    from contextlib import closing
+
+    from irlcli.envs.adapted import counted_from, first_index
+    from irlcli.envs.registration import make
+    from irlcli.interventions import parse_setting
+
+    with closing(make(env, parse_setting(env, setting))) as world:
+        start = first_index(world)
+        return world.observation_space, counted_from(world.action_space, start), start
 
 
 def _reward_to_torch(session: Session, ref: str, name: str) -> Path:

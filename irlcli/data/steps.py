@@ -128,6 +128,12 @@ def episodes(parts: Iterable[Steps]) -> Iterator[Steps]:
             waiting.append(part.take(slice(begin, None)))
 
 
+def shifted(parts: Iterable[Steps], start: int | np.ndarray) -> Iterator[Steps]:
+    """``parts`` with actions whose first index is ``start``, where it was 0."""
+    for part in parts:
+        yield replace(part, actions=part.actions + start) if np.any(start) else part
+
+
 @dataclass
 class Irregular:
     """Episodes that are not whole, and how many were cut or left out.
@@ -163,6 +169,7 @@ class Check:
         actions: the environment's actions.
         where: environment and settings, for messages.
         irregular: what to do with episodes that are not whole.
+        start: the first index of an action in ``parts``, [K] of several; 0 in what is let through.
     """
 
     horizon: int
@@ -170,6 +177,7 @@ class Check:
     actions: ActionSpace
     where: str
     irregular: Irregular
+    start: int | np.ndarray = 0
     _t: int = 0
     _ended: bool = True
     _setting: int = -1
@@ -198,6 +206,8 @@ class Check:
     def _checked(self, steps: Steps, complete: bool) -> Steps:
         """``steps``; ``complete`` if the last one is the last of its episode."""
         self._check_shapes(steps)
+        if self.actions.discrete:
+            steps = replace(steps, actions=steps.actions - self.start)
         self._check_numbers(steps)
         self._check_order(steps)
         rows = np.arange(len(steps))
@@ -243,11 +253,11 @@ class Check:
                 )
         found, wanted = steps.actions, self.actions
         fits = found.shape == (len(steps), *wanted.shape)
-        if wanted.choices:
-            last = ", ".join(str(n - 1) for n in wanted.choices)
-            listed = f"{len(wanted.choices)} whole numbers from 0 to {last}"
-        elif wanted.discrete:
-            listed = f"whole numbers from 0 to {wanted.size - 1}"
+        counts = np.array(wanted.choices or wanted.size)
+        if wanted.discrete:
+            several = f"{len(wanted.choices)} " if wanted.choices else ""
+            last = _listed(self.start + counts - 1)
+            listed = f"{several}whole numbers from {_listed(self.start)} to {last}"
         else:
             listed = f"vectors of {wanted.size}"
         fits = fits and (found.dtype == np.int64) == wanted.discrete
@@ -259,7 +269,7 @@ class Check:
                 "check --env",
             )
         if wanted.discrete:
-            outside = (found < 0) | (found >= np.array(wanted.choices or wanted.size))
+            outside = (found < self.start) | (found >= self.start + counts)
             bad = np.any(np.reshape(outside, (len(steps), -1)), axis=1)
             _refuse(steps, bad, f"action is not one of the {listed}", "check --env")
 
@@ -302,6 +312,10 @@ class Check:
             "obs differs from next_obs of the step before",
             "the steps of an episode must stand in the order in which they were made",
         )
+
+
+def _listed(numbers: int | np.ndarray) -> str:
+    return ", ".join(map(str, np.atleast_1d(numbers)))
 
 
 def _numbers(array: np.ndarray) -> str:

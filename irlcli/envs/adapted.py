@@ -109,6 +109,21 @@ class Adapted(gymnasium.Wrapper):
         )
 
 
+def first_index(world: gymnasium.Env) -> int | np.ndarray:
+    """What the environment itself calls index 0 of an action: a number, or [K] of several indices."""
+    start = getattr(world.env.action_space, "start", 0) if isinstance(world, Adapted) else 0
+    return start.reshape(-1) if isinstance(start, np.ndarray) else int(start)
+
+
+def counted_from(space: gymnasium.Space, start: int | np.ndarray) -> gymnasium.Space:
+    """``space`` with indices that begin at ``start``, as :func:`first_index` gives it."""
+    if isinstance(space, Discrete):
+        return Discrete(int(space.n), start=int(start))
+    if isinstance(space, MultiDiscrete):
+        return MultiDiscrete(space.nvec, start=np.broadcast_to(start, space.nvec.shape))
+    return space
+
+
 def _flat_observations(space: gymnasium.Space, name: str) -> Box:
     if not isinstance(space, Box):
         raise UsageError(

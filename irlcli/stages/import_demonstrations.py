@@ -101,10 +101,10 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, horizon = p.environment.name, p.environment.max_episode_steps
     settings = [parse_setting(env, text) for text in p.settings]
-    size, actions = _spaces(env, settings)
+    size, actions, start = _spaces(env, settings)
     irregular = Irregular(p.cut)
     expected = Expected(env, p.settings, p.setting_column, horizon, actions, irregular)
-    check = Check(horizon, size, actions, f"{env} {p.settings[0]}", irregular)
+    check = Check(horizon, size, actions, f"{env} {p.settings[0]}", irregular, start)
     parts = check(_read(job.inputs, p, expected))
     written = write_stream(job.output, env, settings, parts, {"imported": p.form})
     for index, text in enumerate(p.settings):
@@ -115,10 +115,11 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", summary)
 
 
-def _spaces(env: str, settings: Sequence[Setting]) -> tuple[int, ActionSpace]:
-    """The length of an observation and the actions of ``env``, the same in all ``settings``."""
+def _spaces(env: str, settings: Sequence[Setting]) -> tuple[int, ActionSpace, Any]:
+    """The length of an observation, the actions and their first index, the same in all settings."""
     from contextlib import closing
 
+    from irlcli.envs.adapted import first_index
     from irlcli.envs.registration import make
     from irlcli.rl.worlds import action_space, observation_size
 
@@ -126,6 +127,7 @@ def _spaces(env: str, settings: Sequence[Setting]) -> tuple[int, ActionSpace]:
     for setting in settings:
         with closing(make(env, setting)) as world:
             found.append((observation_size(world.observation_space), world.action_space))
+            start = first_index(world)
     sizes = sorted({size for size, _ in found})
     if len(sizes) > 1:
         raise UsageError(
@@ -133,7 +135,7 @@ def _spaces(env: str, settings: Sequence[Setting]) -> tuple[int, ActionSpace]:
             "others",
             "import settings with a goal apart from the others",
         )
-    return sizes[0], action_space(found[0][1])
+    return sizes[0], action_space(found[0][1]), start
 
 
 def _read(inputs: Mapping[str, Path], p: Parameters, expected: Expected) -> Iterator[Steps]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.data.exchange.expected import Expected
 from irlcli.data.exchange.transitions import read_transitions, write_transitions
-from irlcli.data.steps import Check, Irregular, pieces
+from irlcli.data.steps import Check, Irregular, pieces, shifted
 from irlcli.data.streaming import read_stream, write_stream
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
@@ -297,6 +297,33 @@ def test_each_of_several_indices_has_choices_of_its_own(tmp_path):
     pq.write_table(table([episode(rng, 3)] * 2), tmp_path / "a.parquet")
     with pytest.raises(UsageError, match="row 0: action is of whole numbers, 1 number, but"):
         imported(tmp_path / "one", tmp_path / "a.parquet", SEVERAL)
+
+
+@pytest.mark.parametrize(
+    ("space", "start", "chosen", "listed"),
+    [
+        (DISCRETE, 2, 1, "the whole numbers from 2 to 5"),
+        (SEVERAL, np.array([-1, 1]), [-2, 1], "the 2 whole numbers from -1, 1 to 1, 2"),
+    ],
+)
+def test_indices_are_those_of_the_environment(tmp_path, space, start, chosen, listed):
+    made = episode(np.random.default_rng(0), 6, space)
+    counted = made | {"action": [a + start for a in made["action"]]}
+    pq.write_table(table([counted], TEXTS[:1]), tmp_path / "a.parquet")
+    wanted = expected(space, texts=TEXTS[:1])
+    check = Check(HORIZON, 3, space, ENV, wanted.irregular, start)
+    (steps,) = check(read_transitions(tmp_path / "a.parquet", wanted))
+    np.testing.assert_array_equal(steps.actions, made["action"])
+    (out,) = shifted([steps], start)
+    np.testing.assert_array_equal(out.actions, counted["action"])
+    counted["action"][3] = chosen
+    pq.write_table(table([counted], TEXTS[:1]), tmp_path / "b.parquet")
+    with pytest.raises(UsageError, match=f"row 3: action is not one of {listed}"):
+        list(
+            Check(HORIZON, 3, space, ENV, wanted.irregular, start)(
+                read_transitions(tmp_path / "b.parquet", wanted)
+            )
+        )
 
 
 def test_whole_numbers_are_continuous_actions_too(tmp_path):

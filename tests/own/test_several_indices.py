@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gymnasium
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -73,6 +74,8 @@ def test_the_chain_and_the_way_out_and_back(pulled):
 
     for to, back in (("parquet:out.parquet", "out.parquet"), ("minari:me/cart-v0",) * 2):
         assert pulled.irl("export", "demos", "demos", "--to", to).code == 0
+        # As the environment counts: from -1 and from 1.
+        assert first_exported(back).tolist() == (first + np.array([-1, 1])).tolist()
         assert equal(groups(made(pulled, "import", back, *own, "--quiet")), groups(demos))
 
     reward = irlcli.load_reward(learned.id)
@@ -91,6 +94,17 @@ def test_the_chain_and_the_way_out_and_back(pulled):
     following, earned, *_ = world.step(np.array([1, 2]))
     told = reward(seen[None], np.array([[2, 1]]), following[None], np.array([False]))
     assert earned == pytest.approx(told[0])
+
+
+def first_exported(source):
+    """The actions of the first episode."""
+    if source.startswith("minari:"):
+        dataset = pytest.importorskip("minari").load_dataset(source.removeprefix("minari:"))
+        actions = dataset[0].actions
+        assert dataset.action_space.contains(actions[0])
+        return actions
+    rows = pq.read_table(source, filters=[("episode", "=", 0)])
+    return np.array(rows["action"].to_pylist())
 
 
 def test_a_clone_and_a_saved_model_choose_several_indices(pulled):
