@@ -1,4 +1,7 @@
-"""Seeds derived from a purpose, so that two uses of one seed never share random numbers."""
+"""Seeds derived from a purpose, so that two uses of one seed do not share random numbers.
+
+Exception: random actions in a built-in environment (:func:`irlcli.rl.rollout.roll_out`).
+"""
 
 import zlib
 

@@ -27,7 +27,8 @@ from irlcli.errors import NotFound, UsageError, of_types, suggest
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,39}"
 _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _MAX_NUMBER = 1e300
-# Version of how such environments are stepped (irlcli.envs.adapted); part of every key.
+# Version of how such environments are stepped (irlcli.envs.adapted, irlcli.rl.rollout); part of
+# every key.
 _PHYSICS = 2
 # What the column ``t`` of demonstrations holds.
 _Steps = Annotated[int, Meta(ge=1, le=2**31 - 1)]

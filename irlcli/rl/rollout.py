@@ -36,6 +36,8 @@ def roll_out(
     Episode k starts from a state of its own, derived from (purpose, seed, k). The actions of
     the ``parallel`` episodes that run together come from one generator. With probability
     ``noise`` an action is replaced by a uniformly random one (D-REX, Brown et al. 2019, Sec. 4).
+    In a built-in environment the random numbers of the random agent and of ``noise`` are those that
+    the first of these episodes is reset with, so there they are not independent of its start.
 
     Where the setting has a cue that the policy does not take, the policy acts without it, and the
     hints are added afterwards (:mod:`irlcli.envs.cue`): so experts demonstrate.
@@ -57,7 +59,10 @@ def roll_out(
         batch = range(first, min(first + parallel, episodes))
         seeds = [derive(purpose, seed, k)[0] for k in batch]
         torch.manual_seed(seeds[0])
-        rng = np.random.default_rng(seeds[0])
+        own = environment(env).own is not None
+        rng = np.random.default_rng(
+            derive(f"{purpose} actions", seed, first)[0] if own else seeds[0]
+        )
         worlds = [make(env, setting) for _ in batch]
         if isinstance(policy, Policy):
             require_observations(policy, worlds[0].observation_space, f"{env} {setting}")

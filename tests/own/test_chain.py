@@ -6,14 +6,20 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import irlcli
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs import registration, registry
+from irlcli.envs.registration import make
+from irlcli.envs.registry import resolve
 from irlcli.errors import NotFound
+from irlcli.interventions import Setting
+from irlcli.rl.rollout import roll_out
 from irlcli.store import Store
 
 SMOKE = ("--profile", "smoke", "--quiet")
@@ -138,6 +144,15 @@ def test_a_process_does_not_mix_two_versions_of_a_module(bench):
     stale = bench.irl(*idle)
     assert stale.code == 1 and "changed since this process imported it" in stale.err
     assert [a.manifest.record.stage for a in Store("runs").artefacts()] == ["evaluate"]
+
+
+def test_random_actions_are_independent_of_the_first_start(bench):
+    resolve("cart.toml")
+    (acted,) = roll_out("cart", Setting(), "random", 1, 0, "evaluate")
+    with closing(make("cart", Setting())) as world:
+        world.reset(seed=acted.seed)
+        drawn = world.unwrapped.np_random.uniform(-1.0, 1.0, len(acted) - 1)
+    assert abs(np.corrcoef(acted.actions[1:, 0], drawn)[0, 1]) < 0.9
 
 
 def test_workers_make_the_same_bytes(bench):
