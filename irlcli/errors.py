@@ -122,5 +122,5 @@ def suggest(name: str, known: Iterable[str]) -> str:
     """A hint for a mistyped ``name``: the most similar known name, and all known names."""
     known = sorted(known)
     close = closest(name, known)
-    listed = f"known: {', '.join(known)}"
+    listed = f"known: {', '.join(known) or 'none'}"
     return f"did you mean {close!r}? {listed}" if close else listed

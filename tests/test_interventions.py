@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from irlcli.envs.registration import make
 from irlcli.envs.registry import ENVIRONMENTS, environment
 from irlcli.envs.spec import EnvironmentSpec, Knob
-from irlcli.errors import IrlError, UsageError
+from irlcli.errors import IrlError, UsageError, suggest
 from irlcli.interventions import (
     Setting,
     Value,
@@ -253,6 +253,10 @@ def test_unknown_knob_is_suggested():
     with pytest.raises(UsageError, match="engine-powr") as caught:
         knob_of(LANDER, "engine-powr")
     assert "did you mean 'engine-power'" in caught.value.hint
+
+
+def test_a_hint_without_known_names_says_so():
+    assert suggest("gain", []) == "known: none"
 
 
 def test_knob_of_another_environment_names_its_owner():

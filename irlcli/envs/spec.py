@@ -7,7 +7,7 @@ Form = Literal["multiplier", "absolute", "triple", "range"]
 
 
 class Cue(NamedTuple):
-    """What a cue tells, see :mod:`irlcli.envs.cue`.
+    """The meaning of a cue, see :mod:`irlcli.envs.cue`.
 
     Attributes:
         base: the setting that a cue alone is added to; its expert demonstrates.
@@ -30,7 +30,7 @@ class Knob(NamedTuple):
         description: short noun phrase for messages.
         whole: whether only whole numbers are allowed.
         observed: what the knob adds to the observation, as in "a goal"; empty if nothing.
-        cue: what a cue tells, if the value is the strength of one and no keyword argument.
+        cue: its meaning, if the value is the strength of a cue and no keyword argument.
     """
 
     argument: str
@@ -84,7 +84,7 @@ class Needs(NamedTuple):
 
 
 class Own(NamedTuple):
-    """What an environment from outside the package has, and a built-in one has not.
+    """What only an environment from outside the package has.
 
     Attributes:
         id: in Gymnasium's registry, as ``module:EnvId``; None if it has an entry point.

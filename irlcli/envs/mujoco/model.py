@@ -34,8 +34,8 @@ class Changes(NamedTuple):
         gravity: of 9.81 m/s^2.
         leg_length: of every length of the legs but their thickness.
         actuator_strength: of every motor's torque.
-        joint_limit: of every joint's range. The end of it that is nearer to the starting pose, or
-            the starting pose if it lies within, stays where it is.
+        joint_limit: of every joint's range. A range that contains the starting pose is scaled about
+            that pose, any other about its end that is nearer to it.
     """
 
     mass: float = 1.0
