@@ -7,6 +7,9 @@ and the first discrete action is 0. Mistakes in the environment's own code are r
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from numbers import Real
 from typing import Any
 
@@ -18,6 +21,13 @@ from irlcli.errors import StageFailed, UsageError
 
 # The largest that the description of a reward or a policy may hold.
 _LARGEST_OBSERVATION = 4096
+
+
+@contextmanager
+def prints_aside() -> Iterator[None]:
+    """What an environment prints goes to stderr: stdout is the data of commands."""
+    with redirect_stdout(sys.stderr):
+        yield
 
 
 class Adapted(gymnasium.Wrapper):
@@ -38,6 +48,7 @@ class Adapted(gymnasium.Wrapper):
         self.action_space = _flat_actions(env.action_space, name)
         self._actions: Any = env.action_space
 
+    @prints_aside()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         try:
             observation, info = self.env.reset(seed=seed, options=options)
@@ -45,6 +56,7 @@ class Adapted(gymnasium.Wrapper):
             raise self._failed("reset", error) from error
         return self._seen(observation, "reset"), info
 
+    @prints_aside()
     def step(self, action: Any) -> Any:
         try:
             observation, reward, terminated, truncated, info = self.env.step(self._taken(action))

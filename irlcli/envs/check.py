@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium.utils.env_checker import check_env
 
-from irlcli.envs.adapted import Adapted
+from irlcli.envs.adapted import Adapted, prints_aside
 from irlcli.envs.registration import make
 from irlcli.envs.spec import EnvironmentSpec, Knob
 from irlcli.errors import IrlError
@@ -112,6 +112,7 @@ def _make(spec: EnvironmentSpec, setting: Setting, seed: int) -> list[np.ndarray
         return [np.stack(observations), np.array(rewards)]
 
 
+@prints_aside()
 def _check_env(spec: EnvironmentSpec) -> None:
     with closing(make(spec.name, Setting())) as world:
         # As its author wrote it: without the flat spaces, and without gymnasium's own wrappers.

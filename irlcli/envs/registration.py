@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from irlcli.envs.adapted import Adapted
+from irlcli.envs.adapted import Adapted, prints_aside
 from irlcli.envs.code import code_of
 from irlcli.envs.cue import CueWorld
 from irlcli.envs.own import check_code, module_of
@@ -135,6 +135,7 @@ def observed_of(spec: EnvironmentSpec) -> tuple[int | None, bool]:
     return steps, not isinstance(world.action_space, gymnasium.spaces.Box)
 
 
+@prints_aside()
 def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str) -> gymnasium.Env:
     """An environment from outside the package, with the wrappers that its registration asks for."""
     keywords = own.arguments | arguments

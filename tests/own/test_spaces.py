@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import ClassVar
 
@@ -217,6 +218,16 @@ def test_discrete_actions_that_begin_at_another_number(bench):
     assert done.code == 0, done.err
     demos = read_demonstrations(Store("runs").resolve("demos").artefact.directory)
     assert {int(a) for t in demos.trajectories["mass=2x"] for a in t.actions} == {0, 1, 2}
+
+
+def test_what_an_environment_prints_is_no_data(bench):
+    for old in ("self.drag = drag", "reward = 1.0", "super().reset(seed=seed)"):
+        bench.edit(bench.module, old, f"print('hello')\n        {old}")
+    bench.edit(bench.module, "import numpy as np", "import numpy as np\nprint('imported')")
+    for words in ((*RANDOM, *ONE), ("envs", "check", "cart.toml")):
+        done = bench.irl(*words, "--json")
+        assert done.code == 0 and json.loads(done.out), done.err
+        assert "hello" in done.err
 
 
 def test_the_example_passes_every_check(bench):
