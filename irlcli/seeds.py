@@ -1,6 +1,7 @@
 """Seeds derived from a purpose, so that two uses of one seed do not share random numbers.
 
-Exception: random actions in a built-in environment (:func:`irlcli.rl.rollout.roll_out`).
+Exceptions: random actions in a built-in environment (:func:`irlcli.rl.rollout.roll_out`); and, by
+torch and NumPy from one seed, the noise of a trained policy's actions and its minibatches.
 """
 
 import zlib
