@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -171,3 +172,11 @@ def test_a_store_that_does_not_exist_has_nothing_to_collect(tmp_path):
     store = Store(tmp_path / "absent")
     assert (store.garbage(0), store.stale_work(0), store.names(), store.ids()) == ([], [], {}, [])
     assert store.collect(0) == ([], [])
+
+
+def test_a_full_disk_is_collected(empty_store, family, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", full)
+    assert len(empty_store.collect(DAY)[0]) == len(family)
