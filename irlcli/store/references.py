@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,21 +46,32 @@ def resolve(layout: Layout, ref: str) -> Resolved:
         NotFound: nothing matches, or more than one artefact.
         IntegrityError: the artefact is damaged.
     """
-    root, absolute = os.path.abspath(layout.root), os.path.abspath(ref)
-    inside = absolute.startswith(root + os.sep)
-    text = os.path.relpath(absolute, root) if inside else ref.rstrip("/")
+    below = _below(os.path.abspath(layout.root), os.path.abspath(ref))
+    text = ref.rstrip("/") if below is None else below
     found = _inside(layout, text)
-    if found is None and not inside:
+    if found is None and below is None:
+        # The store, or a directory above it, may be known by several names: `runs` is a link, say.
+        with suppress(ValueError):  # No path has such characters.
+            below = _below(os.path.realpath(layout.root), os.path.realpath(ref))
+        if below is not None:
+            text = below
+            found = _inside(layout, text)
+    if found is None and below is None:
         if os.path.exists(ref):
             return Resolved(None, Path(ref))
         # A path printed by a run with the default store, used with a store elsewhere.
-        default, _, below = os.path.normpath(text).partition("/")
-        if default == DEFAULT_ROOT and below:
-            text = below
+        default, _, rest = os.path.normpath(text).partition("/")
+        if default == DEFAULT_ROOT and rest:
+            text = rest
             found = _inside(layout, text)
     if found is None:
         raise _unknown(layout, ref, text)
     return found
+
+
+def _below(root: str, path: str) -> str | None:
+    """``path`` relative to ``root``; None if it is not below it."""
+    return os.path.relpath(path, root) if path.startswith(root + os.sep) else None
 
 
 def _unknown(layout: Layout, ref: str, text: str) -> NotFound:

@@ -66,6 +66,16 @@ def test_paths_inside_the_store(empty_store, artefact, monkeypatch, form, rest):
     assert found.path.exists()
 
 
+@pytest.mark.parametrize("rest", ["", "/reward.pt"])
+@pytest.mark.parametrize(("store", "path"), [("link", "runs"), ("runs", "link")])
+def test_a_store_behind_a_link_has_two_names(empty_store, artefact, monkeypatch, store, path, rest):
+    monkeypatch.chdir(empty_store.root.parent)
+    Path("link").symlink_to(empty_store.root)
+    found = Store(store).resolve(os.path.abspath(f"{path}/{artefact.id[:5]}{rest}"))
+    assert found.artefact is not None and found.artefact.id == artefact.id
+    assert found.output == (rest.strip("/") or None)
+
+
 def test_from_inside_the_store_directory(empty_store, artefact, monkeypatch):
     monkeypatch.chdir(empty_store.root)
     store = Store(".")
