@@ -47,7 +47,7 @@ def export(
 def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
     directory = checked(session.store, source)
-    with _new_file(Path(name)) as path:
+    with _new_file(session, Path(name)) as path:
         from irlcli.data.exchange.transitions import write_transitions
         from irlcli.data.steps import shifted
         from irlcli.data.streaming import read_stream
@@ -66,7 +66,7 @@ def _demos_to_minari(session: Session, ref: str, name: str) -> Path:
     if dataset.exists():
         raise UsageError(f"Minari has a dataset {name!r} already", "raise its version: -v1")
     dataset.parent.mkdir(parents=True, exist_ok=True)
-    with _new_file(dataset) as path:
+    with _new_file(session, dataset) as path:
         from irlcli.data.exchange.minari import declare_namespace, write_minari
         from irlcli.data.steps import shifted
         from irlcli.data.streaming import read_stream
@@ -96,7 +96,7 @@ def _spaces(env: str, setting: str) -> tuple[Any, Any, Any]:
 
 def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
     references.tensor_file(session.store, ref, "reward")
-    with _new_file(Path(name)) as path:
+    with _new_file(session, Path(name)) as path:
         from irlcli.data.exchange.torch_export import write_reward
         from irlcli.rewards import load_reward
 
@@ -106,19 +106,15 @@ def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
 
 
 @contextmanager
-def _new_file(path: Path) -> Iterator[Path]:
+def _new_file(session: Session, path: Path) -> Iterator[Path]:
     """A file or directory beside ``path`` that takes its name once it is whole.
 
     Raises:
-        UsageError: ``path`` exists or cannot be written.
+        UsageError: ``path`` exists, lies in the store, or cannot be written.
     """
     if path.exists():
         raise UsageError(f"{path} exists", "name another file, or remove it first")
-    if not path.parent.is_dir():
-        raise UsageError(
-            f"{path} cannot be written: {path.parent} is not a directory",
-            "create the directory first",
-        )
+    session.check_file(path, "--to")
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".irl-export-") as scratch:
             part = Path(scratch) / path.name

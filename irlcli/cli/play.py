@@ -63,12 +63,7 @@ def play(
     settings += [one for one in added if one not in settings]
     if file.suffix.lower() not in (".gif", ".mp4"):
         raise UsageError(f"{str(file)!r} ends in neither .gif nor .mp4", "name such a file")
-    if not file.parent.is_dir():
-        raise UsageError(
-            f"{file} cannot be written: {file.parent} is not a directory",
-            "create the directory first",
-        )
-
+    session.check_file(file, "--out")
     scored_by = _scored_by(session, source, reward)
     if scored_by is not None:
         arguments.check_env(reward or "its reward", scored_by[1].env, env)

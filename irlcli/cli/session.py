@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.cli import console as out
-from irlcli.errors import NotFound
+from irlcli.errors import NotFound, UsageError
 from irlcli.requests import session as base
 from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
 from irlcli.store import Artefact
@@ -53,6 +53,20 @@ class Session(base.Session):
                 "name another with --store or IRL_STORE; a command that makes an artefact "
                 "creates the store",
             )
+
+    def check_file(self, path: Path, option: str) -> None:
+        """Refuse a file to write, which ``option`` named, before any work is done.
+
+        Raises:
+            UsageError: its directory does not exist, or lies in the store.
+        """
+        if not path.parent.is_dir():
+            raise UsageError(
+                f"{path} cannot be written: {path.parent} is not a directory",
+                "create the directory first",
+            )
+        if path.resolve().is_relative_to(self.store.root.resolve()):
+            raise UsageError(f"{path} lies in the store", f"name another file with {option}")
 
 
 class StageSession(base.StageSession):

@@ -203,9 +203,12 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
 
 def test_an_export_never_replaces_a_file(irl, store_copy, exported, tmp_path):
     before = exported.read_bytes()
+    inside = Store(store_copy.path).resolve("airl").artefact.directory / "added"
     for words, code, named in (
         (["demos", "demos", "--to", f"parquet:{exported}"], 2, "exists"),
         (["demos", "demos", "--to", f"parquet:{tmp_path}/no/x.parquet"], 2, "not a directory"),
+        (["demos", "demos", "--to", f"parquet:{inside}"], 2, "lies in the store"),
+        (["reward", "airl", "--to", f"torch-export:{inside}"], 2, "lies in the store"),
         (["demos", "demos", "--to", "csv:x"], 2, "'csv:x'"),
         (["demos", "demos", "--to", "parquet:"], 2, "'parquet:'"),
         (["demos", "demos", "--to", "minari:me"], 2, "'me'"),
