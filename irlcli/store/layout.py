@@ -11,6 +11,8 @@
     runs/.jobs/                    what was submitted to a cluster, with the jobs' logs
 """
 
+import errno
+import os
 import re
 import stat
 from collections.abc import Iterator
@@ -19,7 +21,7 @@ from typing import NamedTuple
 
 from irlcli.errors import IntegrityError, StageFailed, UsageError
 from irlcli.store.digest import is_hexadecimal
-from irlcli.store.durable import write_durably
+from irlcli.store.durable import unique_name, write_durably
 from irlcli.store.manifest import read_json
 
 FORMAT = 1
@@ -31,6 +33,7 @@ _NAME = r"[A-Za-z][A-Za-z0-9._-]{0,99}"
 _OWN = (".keys", ".names", ".work", ".locks", ".quarantine")
 # Made by those who submit to a cluster.
 _JOBS = ".jobs"
+_NO_LINKS = (errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 class Layout(NamedTuple):
@@ -101,7 +104,7 @@ def check(layout: Layout) -> None:
         if version > FORMAT:
             raise IntegrityError(
                 f"{root} is a store of format {version}, newer than the supported {FORMAT}",
-                "a newer irlcli wrote it: upgrade irlcli, or name another --store",
+                "a newer irlcli wrote it: upgrade irlcli, or name another store",
             )
     elif root.exists() and any(
         # An interrupted create() leaves these behind.
@@ -110,7 +113,7 @@ def check(layout: Layout) -> None:
     ):
         raise IntegrityError(
             f"{root} contains files but is not a store",
-            "name a store, or an empty or new directory, with --store",
+            "name a store, or an empty or new directory",
         )
     for name in (*_OWN, _JOBS):
         if (root / name).is_symlink():
@@ -124,7 +127,7 @@ def create(layout: Layout) -> None:
     """Create the directories and the format marker if they are missing.
 
     Raises:
-        StageFailed: the root cannot be written.
+        StageFailed: the root cannot be written, or its file system has no hard links.
     """
     if layout.marker.exists():
         return
@@ -132,12 +135,28 @@ def create(layout: Layout) -> None:
         make_directories(layout)
         # Created now: a user who may only read the store later cannot create it, but can lock it.
         layout.gc_lock.touch()
+        _check_links(layout)
         write_durably(layout.marker, b'{"format": %d}\n' % FORMAT)
     except OSError as error:
         raise StageFailed(
             f"{layout.root} cannot become a store ({error.strerror or error})",
-            "name a directory that can be written, with --store or IRL_STORE",
+            "name a directory that can be written, with --store (IRL_STORE) or --to",
         ) from None
+
+
+def _check_links(layout: Layout) -> None:
+    """Refuse a file system without hard links now: publishing would fail after the work."""
+    own = layout.locks / unique_name(".link")
+    try:
+        os.link(layout.gc_lock, own)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        raise StageFailed(
+            f"{layout.root} is on a file system without hard links",
+            "name a directory on another file system, with --store (IRL_STORE) or --to",
+        ) from None
+    own.unlink()
 
 
 def make_directories(layout: Layout) -> None:

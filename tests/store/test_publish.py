@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from every_step import ENOUGH, counter, in_child, intercept, kill_self
 
+from irlcli.errors import StageFailed
 from irlcli.store import KeyRecord, Published, Store
 
 FILES = {"reward.pt": bytes(range(256)) * 4, "nested/table.parquet": b"PAR1" * 64}
@@ -360,3 +361,20 @@ def test_many_processes_publish_at_once(tmp_path):
     assert store.verify(store.ids()) == {}
     found = store.find(RECORD.key)
     assert found is not None and found.id in store.ids()
+
+
+def test_a_file_system_without_hard_links_is_refused_before_the_work(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", refuse)
+        for _ in range(2):
+            with pytest.raises(
+                StageFailed, match="is on a file system without hard links"
+            ) as caught:
+                Store(tmp_path / "runs").create()
+            assert "--store" in caught.value.hint
+    store = Store(tmp_path / "runs")
+    store.create()
+    assert [p.name for p in (store.root / ".locks").iterdir()] == ["gc"]
