@@ -29,16 +29,20 @@ VENV    ?= .venv
 STORE   ?= $(or $(IRL_STORE),runs)
 PROFILE ?= standard
 JOBS    ?= 2
-FROM    ?= zoo
-# ROWS with commas, and, sorted as irl does, as part of names and directories.
+FROM    ?= $(wildcard zoo)
+# ROWS with commas; the chosen part of a table, sorted as irl does, in names and directories.
 COMMA   := ,
 LISTED   = $(subst $(eval) ,$(COMMA),$(strip $(ROWS)))
-ROWNAME  = $(addprefix -,$(subst /,-,$(subst $(eval) ,-,$(sort $(subst $(COMMA), ,$(ROWS))))))
-RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(ROWNAME)
+dashed   = $(subst /,-,$(subst $(eval) ,-,$(sort $(subst $(COMMA), ,$(1)))))
+PART     = $(addprefix -,$(call dashed,$(ROWS)))$(addprefix -,$(call dashed,$(METHODS)))$(addprefix -seeds-,$(call dashed,$(SEEDS)))
+RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(PART)
+# What names begin with, as irl chooses it: a table with settings of its own has a tag of its own.
+OWN     := demo control-airl-5 table1-5
+named    = $(or $(TAG),$(if $(filter $(1),$(OWN)),$(1)$(addprefix -,$(filter-out standard,$(PROFILE))),$(PROFILE)))
 
 IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
-CHOSEN   = --store $(STORE) --profile $(PROFILE) $(foreach place,$(FROM),$(addprefix --from ,$(if $(findstring ://,$(place)),$(place),$(wildcard $(place))))) $(SET) $(CHOOSE) \
+CHOSEN   = --store $(STORE) --profile $(PROFILE) $(addprefix --from ,$(FROM)) $(SET) $(CHOOSE) \
     $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --rows ,$(LISTED))
 OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
@@ -74,7 +78,7 @@ demo: $(READY)
 	$(IRL) run demo $(OPTIONS) --out $(RESULTS)
 	@echo; echo "report: $(RESULTS)/README.md and $(RESULTS)/demo.html"
 	@echo; echo "what the retrained policy of AIRL-IRM was made from:"
-	@$(IRL) lineage --store $(STORE) $(or $(TAG),demo).lunar-lander.engine-power.irm.0.transfer
+	@$(IRL) lineage --store $(STORE) $(call named,demo).lunar-lander.engine-power.irm.0.transfer
 
 all-results: experts table1 figure2 figure3 figure4 table2
 
@@ -93,8 +97,8 @@ experts figure2 control: $(READY)
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 
 report-%: $(READY)
-	$(IRL) report $* $(CHOSEN) --name $(or $(TAG),$(PROFILE)).$*$(ROWNAME) \
-	    --out results/$(or $(TAG),$(PROFILE))/$*$(ROWNAME)
+	$(IRL) report $* $(CHOSEN) --name $(call named,$*).$*$(PART) \
+	    --out results/$(or $(TAG),$(PROFILE))/$*$(PART)
 
 # The values of settings/*.toml; needs no store.
 table2: $(READY)

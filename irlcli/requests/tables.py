@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _WEIGHT = "airl.penalty_weight"
 # In a name, which may have 100 characters in all.
-_LONGEST_ROWS = 50
+_LONGEST_PART = 50
 
 
 class Choice(NamedTuple):
@@ -41,11 +41,13 @@ class Choice(NamedTuple):
         return [arguments.row(word.strip()) for word in self.rows.split(",") if word.strip()]
 
     def report_name(self, tag: str) -> str:
-        """The name of the report on this choice: ``standard.table1-ant``, say."""
-        rows = "-".join(sorted(self.row_names() or ()))
-        if len(rows) > _LONGEST_ROWS:
-            rows = hashlib.sha256(rows.encode()).hexdigest()[:8]
-        return f"{tag}.{self.table}" + (f"-{rows}" if rows else "")
+        """The name of the report on this choice: ``standard.table1-ant-erm-irm-seeds-0-1``, say."""
+        words = [*sorted(self.row_names() or ()), *sorted(_words(self.methods or ""))]
+        words += ["seeds", *sorted(_words(self.seeds))] if self.seeds else []
+        part = "-".join(words)
+        if len(part) > _LONGEST_PART:
+            part = hashlib.sha256(part.encode()).hexdigest()[:8]
+        return f"{tag}.{self.table}" + (f"-{part}" if part else "")
 
     def words(self) -> list[str]:
         """The options that make the same choice of rows and runs on another command line."""

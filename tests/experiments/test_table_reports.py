@@ -13,6 +13,8 @@ from test_architecture import loaded_by
 
 from irlcli.configs import load_config
 from irlcli.envs.registry import environment
+from irlcli.experiments.tables import load_tables
+from irlcli.requests.tables import Choice
 from irlcli.store import Store
 from irlcli.store.manifest import encode_provenance
 
@@ -538,17 +540,29 @@ def test_make_passes_its_variables_on():
     assert "--store elsewhere " in commands("demo", "IRL_STORE=elsewhere")[0]
     assert "--store here " in commands("demo", "IRL_STORE=elsewhere", "STORE=here")[0]
     assert "--from settings " in commands("demo", "FROM=settings")[0]
-    assert "--from" not in commands("demo", "FROM=no-such-directory")[0]
+    assert "--from zooo " in commands("demo", "FROM=zooo")[0]
+    assert "--from" not in commands("demo", "FROM=")[0]
+    assert "--from zoo " in plain[0]
     chosen = commands("figure3", "SEEDS=0 1", "METHODS=erm irm", "ROWS=ant", "TAG=x", "JOBS=4")[-1]
     for words in ('--seeds "0 1"', '--methods "erm irm"', "--rows ant", "--tag x", "--jobs 4"):
         assert f" {words} " in chosen
-    assert chosen.endswith("--out results/x/figure3-ant")
+    assert chosen.endswith("--out results/x/figure3-ant-erm-irm-seeds-0-1")
     assert commands("experts", "RESULTS=docs/results/experts")[0].endswith(
         "--out docs/results/experts"
     )
     ablation = commands("retraining", "METHODS=irm", "FROM=settings", "JOBS=4", "TAG=x")
-    assert len(ablation) == 5 and ablation[-1].endswith("--out results/x/retraining")
+    assert len(ablation) == 5 and ablation[-1].endswith("--out results/x/retraining-irm")
     assert all(f" {w} " in ablation[-1] for w in ('--methods "irm"', "--from settings", "--jobs 4"))
     report = commands("report-table1")[0]
     assert "--name standard.table1 " in report
     assert report.endswith("--out results/standard/table1")
+    part = commands("report-table1", "ROWS=ant", "METHODS=irm,erm", "SEEDS=1 0")[0]
+    assert f"--name {Choice('table1', '1 0', 'irm,erm', 'ant').report_name('standard')} " in part
+    assert part.endswith("--out results/standard/table1-ant-erm-irm-seeds-0-1")
+    own = [name for name, table in load_tables().items() if table.settings is not None]
+    assert len(own) == 3
+    for table in own:
+        assert f"--name {table}.{table} " in commands(f"report-{table}")[0]
+        smoke = commands(f"report-{table}", "PROFILE=smoke")[0]
+        assert f"--name {table}-smoke.{table} " in smoke
+    assert " demo-smoke.lunar-lander." in commands("demo", "PROFILE=smoke")[-1]
