@@ -1,5 +1,6 @@
 """``irl push`` and ``irl pull``: artefacts from one store to another."""
 
+import shlex
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -59,9 +60,15 @@ def pull(
     try:
         artefacts = _chosen(place, refs, everything)
     except NotFound as error:
+        listing = shlex.join(["irl", "ls", "--from", str(place.root)])
         raise NotFound(
-            f"{place.root}: {error.message}", f"`irl ls --from {place.root}` lists what is there"
+            f"{place.root}: {error.message}", f"`{listing}` lists what is there"
         ) from None
+    except NewerFormat:
+        raise
+    except IntegrityError as error:
+        error.hint = _damaged_there(place)
+        raise
     _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet)
 
 
@@ -117,7 +124,7 @@ def _share(
     except IntegrityError as error:
         # The place to copy to can be at fault, too.
         if error.message.startswith(f"{source.root}/") and not isinstance(error, NewerFormat):
-            error.hint = f"remove the artefact in {source.root}, then compute or push it again"
+            error.hint = _damaged_there(source)
         raise
     finally:
         console.close()
@@ -149,6 +156,10 @@ def _share(
         return
     for artefact in artefacts:
         out.print_data(where + artefact.id)
+
+
+def _damaged_there(place: "Place") -> str:
+    return f"remove the artefact in {place.root}, then compute or push it again"
 
 
 def _artefacts(count: int) -> str:

@@ -123,10 +123,11 @@ def ids(layout: Layout) -> list[str]:
 def index(layout: Layout, warn: Callable[[str], None]) -> Index:
     """All artefacts, each manifest read once.
 
-    Artefacts of a newer schema are left out, each with a warning.
+    Artefacts of a newer schema are left out, each with a warning; in a read-only store, so are
+    damaged ones, which stay where they are.
 
     Raises:
-        IntegrityError: as :func:`get`.
+        IntegrityError: as :func:`get`, unless the store is read-only.
     """
     artefacts, newer = {}, {}
     for id16 in ids(layout):
@@ -138,6 +139,10 @@ def index(layout: Layout, warn: Callable[[str], None]) -> Index:
         except NewerFormat as error:
             newer[id16] = (layout.root / id16 / MANIFEST).read_bytes()
             warn(f"skipping artefact {id16}: {error.message}; {error.hint}")
+        except IntegrityError as error:
+            if not layout.read_only:
+                raise
+            warn(f"skipping an artefact of the store {layout.root}: {error.message}")
     return Index(artefacts, newer)
 
 

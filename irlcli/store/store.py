@@ -116,7 +116,8 @@ class Store:
 
     def index(self) -> Index:
         """All artefacts: see :func:`irlcli.store.read.index`."""
-        return read.index(self._layout, self.warn)
+        self._index = read.index(self._layout, self.warn)
+        return self._index
 
     def artefacts(self) -> Iterator[Artefact]:
         """The artefacts of :meth:`index`."""

@@ -6,6 +6,7 @@ import http.server
 import json
 import threading
 from functools import partial
+from pathlib import Path
 
 import fsspec
 import pytest
@@ -50,6 +51,24 @@ def test_damage_there_is_named_and_not_published(
         push(store, url, chain["airl"])
         assert len(pull(url, theirs, "irm-0").copied) > 0
         assert set(theirs.ids()) == {a.id for a in chain.values()}
+
+
+@pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
+def test_a_damaged_manifest_there_leaves_the_others(irl, store, chain, place, tmp_path):
+    push(store, place, *chain.values())
+    if "://" in place:
+        emptied(at(place, chain["airl"], "manifest.json"))
+    else:
+        manifest = Path(place) / chain["airl"].id / "manifest.json"
+        manifest.chmod(0o644)
+        manifest.write_bytes(b"")
+    listed = irl("ls", "--from", place)
+    assert listed.code == 0 and chain["demos"].id in listed.out and chain["airl"].id in listed.err
+    pulled = irl("pull", "--all", "--from", place, "--store", tmp_path / "other")
+    assert pulled.code == 0 and pulled.err.count(f"{chain['airl'].id}/manifest.json") == 1
+    assert set(other(tmp_path).ids()) == {chain["expert"].id, chain["demos"].id}
+    refused = irl("pull", chain["airl"].id, "--from", place, "--store", tmp_path / "other")
+    assert refused.code == 4 and f"hint: remove the artefact in {place}" in refused.err
 
 
 def test_a_damaged_artefact_here_is_not_pushed(irl, store, chain, url):
