@@ -92,7 +92,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
                 f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
             )
         candidates = arguments.weights(choice.choose_penalty)
-    tag = choice.tag or _tag(table, session.profile)
+    tag = _tag(table, session.profile) if choice.tag is None else choice.tag
     try:
         session.store.check_name(f"{tag}.{table.name}")
     except UsageError as error:
