@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 
 from irlcli.cli import complete
-from irlcli.cli.session import DEFAULT_PROFILE, DEFAULT_STORE, Session, StageSession
+from irlcli.cli.session import Session, StageSession
+from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
 
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of everything random.")]

@@ -16,16 +16,18 @@ from irlcli.cli.experiments import (
     TableFile,
 )
 from irlcli.cli.options import Name, stage_command
-from irlcli.cli.session import DEFAULT_PROFILE, StageSession
+from irlcli.cli.session import StageSession
 from irlcli.cli.tables import (
     check_out,
     copy_outputs,
     print_report,
     report_json,
     report_of,
+    run_line,
 )
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import NotFound, UsageError, suggest
+from irlcli.requests.session import DEFAULT_PROFILE
 from irlcli.requests.tables import Choice, open_plan
 from irlcli.store import Artefact
 
@@ -138,7 +140,7 @@ def _table(session: StageSession, chosen: Choice, name: str | None, directory: P
     if plan.figure is not None and missing and not session.dry_run:
         raise NotFound(
             f"{session.store.root} lacks {len(missing)} of {len(plan.tasks)} steps of {chosen.table}",
-            f"`{session.suggestion('run', chosen.table, *chosen.words())}` makes them",
+            f"`{run_line(session, chosen)}` makes them",
         )
     request = report_of(session, chosen, plan)
 

@@ -1,7 +1,6 @@
 """What a command works with: a session of its options that prints what it finds and runs."""
 
 import os
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from irlcli.cli import console as out
 from irlcli.errors import NotFound, UsageError
 from irlcli.requests import session as base
-from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
+from irlcli.requests.session import DEFAULT_STORE
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
@@ -115,15 +114,6 @@ class StageSession(base.StageSession):
         words += [] if self.workers == 1 else ["--workers", str(self.workers)]
         words += [] if self.tensorboard is None else ["--tensorboard", str(self.tensorboard)]
         return words if self.wait else [*words, "--no-wait"]
-
-    def suggestion(self, *words: str) -> str:
-        """The command line ``irl WORDS`` on this store and under these configs, for a hint."""
-        configs = self.config_words()
-        if self.profile == DEFAULT_PROFILE:
-            configs = configs[2:]
-        root, known = self.store.root, Path(os.environ.get("IRL_STORE") or DEFAULT_STORE)
-        store = [] if root == known else ["--store", str(root)]
-        return shlex.join(["irl", *words, *configs, *store])
 
     def deliver(
         self,

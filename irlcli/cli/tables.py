@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from irlcli.cli import console as out
 from irlcli.cli.session import StageSession
-from irlcli.errors import StageFailed, UsageError
+from irlcli.errors import NotFound, StageFailed, UsageError
 from irlcli.report.tables import EVERY_CELL
 from irlcli.requests.tables import Choice
 from irlcli.store import Artefact, read_json
@@ -27,7 +27,21 @@ def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":
     from irlcli.experiments import report
 
     words = ["irl", "report", choice.table, *session.config_words(), *choice.words()]
-    return report.request(plan, shlex.join(words))
+    try:
+        return report.request(plan, shlex.join(words))
+    except NotFound as error:
+        error.hint = (
+            f"`{run_line(session, choice)}` makes them. --profile, --set, --seeds and --methods must "
+            "be those of the runs"
+        )
+        raise
+
+
+def run_line(session: StageSession, choice: Choice) -> str:
+    """The command line that makes what a report on ``choice`` lacks, for a hint."""
+    other = session.file or session.overrides or choice.choose_penalty is not None
+    tag = ["--tag", "NAME"] if other else []
+    return session.suggestion("run", choice.table, *choice.words(), *tag)
 
 
 def check_out(directory: Path, store: Path) -> None:

@@ -26,12 +26,14 @@ class Selection(NamedTuple):
         candidates: for lambda; empty if it is not to be chosen, ``own`` for each penalty's.
         until: the last phase.
         only: one step and what it needs.
+        listing: the command line that lists the steps.
     """
 
     tag: str
     candidates: Sequence[float] | Literal["own"] = ()
     until: rows.Phase = PHASES[-1]
     only: str | None = None
+    listing: str = "irl plan"
 
 
 class Plan:
@@ -147,7 +149,7 @@ class Plan:
             hint = f"did you mean {close!r}? " if close else ""
             raise UsageError(
                 f"{self.table.name} has no step {only!r}",
-                f"{hint}`irl plan {self.table.name}` lists the names",
+                f"{hint}`{self.selection.listing}` lists the names",
             )
         kept, pending = set(), [only]
         while pending:

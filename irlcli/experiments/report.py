@@ -35,9 +35,7 @@ def request(plan: Plan, command: str) -> Request:
     cells, sources = _cells(plan)
     if not any(cell.run for cell in cells):
         raise NotFound(
-            f"{plan.lookup.store.root} holds no evaluation of {plan.table.name} with this config",
-            f"`irl run {plan.table.name}` makes them. --profile, --set, --seeds and --methods must "
-            "be those of the runs; `irl ls` lists what exists",
+            f"{plan.lookup.store.root} holds no evaluation of {plan.table.name} with this config"
         )
     artefacts = _artefacts(plan)
     runs, libraries = facts.runs(artefacts.values())
@@ -75,8 +73,7 @@ def _experts(
 ) -> Request:
     if not any(cell.run for cell in cells if cell.agent == "expert"):
         raise NotFound(
-            f"{plan.lookup.store.root} holds no evaluation of an expert with this config",
-            f"`irl run {plan.table.name}` makes them. --profile and --set must be those of the runs",
+            f"{plan.lookup.store.root} holds no evaluation of an expert with this config"
         )
     experts: dict[str, ExpertConfig] = {}
     for row in plan.table.rows:

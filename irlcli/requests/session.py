@@ -1,6 +1,8 @@
 """What options are read and requests are run with: a store, configs, and a console."""
 
+import os
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -59,9 +61,14 @@ class Session:
             kind = "directory" if resolved.path.is_dir() else "file"
             raise NotFound(
                 f"{ref!r} is a {kind}, not an artefact of the store {self.store.root}",
-                "`irl ls` lists the artefacts",
+                f"`{shlex.join(['irl', 'ls', *self.store_words()])}` lists the artefacts",
             )
         return resolved.artefact
+
+    def store_words(self) -> list[str]:
+        """The option that names this store on a command line, unless it is the default."""
+        root, known = self.store.root, Path(os.environ.get("IRL_STORE") or DEFAULT_STORE)
+        return [] if root == known else ["--store", str(root)]
 
     def name(self, name: str, artefact: Artefact) -> None:
         """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
@@ -124,6 +131,13 @@ class StageSession(Session):
         words = ["--profile", self.profile]
         words += [] if self.file is None else ["--settings", str(self.file)]
         return words + [word for item in self.overrides for word in ("--set", item)]
+
+    def suggestion(self, *words: str) -> str:
+        """The command line ``irl WORDS`` on this store and under these configs, for a hint."""
+        configs = self.config_words()
+        if self.profile == DEFAULT_PROFILE:
+            configs = configs[2:]
+        return shlex.join(["irl", *words, *configs, *self.store_words()])
 
     def runner(self) -> "Runner":
         """A runner on the session's store and those to copy from.

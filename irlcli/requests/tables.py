@@ -98,7 +98,9 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     except UsageError as error:
         raise UsageError(f"--tag {tag!r} cannot begin a name", error.hint) from None
     session.table_file = table.settings
-    selection = Selection(tag, candidates, until, choice.only)
+    tag_words = [] if choice.tag is None else ["--tag", choice.tag]
+    listing = session.suggestion("plan", choice.table, *choice.words(), *tag_words)
+    selection = Selection(tag, candidates, until, choice.only, listing)
     plan = Plan(table, selection, session.config, session.runner().lookup())
     _check_weights(session, table)
     for name in (*plan.tasks, choice.report_name(tag)):

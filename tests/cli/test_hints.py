@@ -1,10 +1,12 @@
 """Hints name what is allowed, and are commands that work as they stand."""
 
 import re
+import shlex
 
 import pytest
 
 from irlcli.cli.session import StageSession
+from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
 BOUNCE = "--intervention bounce=0.1"
@@ -141,6 +143,49 @@ def test_the_command_that_trains_a_missing_expert_can_be_typed_as_it_stands(irl,
     (command,) = re.findall(r"`irl ([^`]*)` trains it", told)
     assert irl(*command.split(), "--quiet").code == 0
     assert "trains it" not in irl(*assess).err
+
+
+OWN_TABLE = """
+[small]
+rows = ["lunar-lander.engine-power"]
+methods = ["erm"]
+seeds = [0]
+measures = ["zero-shot"]
+"""
+
+
+def suggested(done):
+    (line,) = re.findall("`irl ([^`]*)`", done.err.splitlines()[-1])
+    return shlex.split(line)
+
+
+@pytest.mark.parametrize(
+    "options", [["--profile", "smoke"], ["--set", "airl.bc_epochs=3"]], ids=["profile", "set"]
+)
+def test_suggested_lines_about_tables_can_be_typed_as_they_stand(irl, tmp_path, options):
+    tables, store = tmp_path / "my tables.toml", tmp_path / "my runs"
+    tables.write_text(OWN_TABLE)
+    words = ["small", "--experiments", tables, "--store", store, "--seeds", "0", *options]
+    lost = irl("plan", *words, "--only", "standard.small.none")
+    assert lost.code == 2
+    listed = irl(*suggested(lost))
+    assert listed.code == 0 and listed.out == irl("plan", *words).out
+    lacking = irl("report", *words)
+    assert lacking.code == 3
+    made = irl(*suggested(lacking), "--until", "demos", "--dry-run")
+    assert made.code == 0, made.err
+    line = suggested(lacking)
+    assert line[0] == "run" and ("--tag" in line) == ("--set" in options)
+
+
+def test_suggested_lines_name_the_store(irl, tmp_path, empty_store):
+    (tmp_path / "file").write_text("")
+    lost = irl("show", tmp_path / "file", "--store", empty_store.root)
+    assert lost.code == 3 and suggested(lost) == ["ls", "--store", str(empty_store.root)]
+    there = tmp_path / "my place"
+    Store(there).create()
+    lost = irl("pull", "irm", "--from", there, "--store", empty_store.root)
+    assert lost.code == 3 and suggested(lost) == ["ls", "--from", str(there)]
 
 
 POWER = "--env lunar-lander --intervention engine-power=1x"
