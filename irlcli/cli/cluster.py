@@ -21,6 +21,19 @@ if TYPE_CHECKING:
 CLUSTERS = ("slurm", "local")
 DEFAULT_TIME, DEFAULT_CPUS, DEFAULT_PARALLELISM, DEFAULT_REQUEUES = "4:00:00", 1, 50, 20
 _WARNING_SECONDS = 90
+# Options of sbatch that every job has already, and the option of irl run that changes them.
+_SET_BY_IRL = {
+    "array": "--array-parallelism",
+    "cpus-per-task": "--cpus",
+    "partition": "--partition",
+    "requeue": "--requeues",
+    "no-requeue": "--requeues 0",
+    "time": "--time",
+    **dict.fromkeys(
+        ("dependency", "error", "job-name", "kill-on-invalid-dep", "open-mode", "output", "signal"),
+        "",
+    ),
+}
 
 
 class ClusterOptions(NamedTuple):
@@ -60,13 +73,13 @@ class ClusterOptions(NamedTuple):
         of_jobs = [name for name, given in (slurm | both).items() if given]
         if self.cluster is None and of_jobs:
             raise UsageError(
-                f"{of_jobs[0]} is about jobs of a cluster", "add --cluster slurm, or omit it"
+                f"{of_jobs[0]} needs --cluster", f"add --cluster slurm, or omit {of_jobs[0]}"
             )
         of_slurm = [name for name, given in slurm.items() if given]
         if self.cluster == "local" and of_slurm:
             raise UsageError(
-                f"{of_slurm[0]} is about Slurm's jobs; --cluster local runs them on this machine",
-                "omit it; --jobs sets how many run at a time",
+                f"{of_slurm[0]} needs --cluster slurm",
+                f"omit {of_slurm[0]}; --jobs sets how many jobs of --cluster local run at a time",
             )
 
 
@@ -91,23 +104,30 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     minutes = parse_minutes(options.time or DEFAULT_TIME)
     # A job of few minutes is warned when half of them are over.
     warning = min(_WARNING_SECONDS, 30 * minutes)
-    extra = {}
-    for item in options.sbatch:
-        name, equals, value = item.partition("=")
-        if not equals or not re.fullmatch(r"[a-z][a-z-]*", name):
-            raise UsageError(
-                f"--sbatch {item!r} is no option of sbatch", "for example --sbatch account=NAME"
-            )
-        extra[name] = value
     resources = Resources(
         options.partition,
         minutes,
         options.cpus or DEFAULT_CPUS,
         options.parallelism or DEFAULT_PARALLELISM,
         warning,
-        extra,
+        dict(_sbatch_option(item) for item in options.sbatch),
     )
     return Slurm(resources) if cluster == "slurm" else Local(session.store, resources)
+
+
+def _sbatch_option(item: str) -> tuple[str, str]:
+    """Name and value of ``--sbatch OPTION=VALUE``."""
+    name, equals, value = item.partition("=")
+    if name in _SET_BY_IRL:
+        option = _SET_BY_IRL[name]
+        raise UsageError(
+            f"irl sets sbatch's {name} itself", f"use {option}" if option else f"omit {name}"
+        )
+    if not equals or not re.fullmatch(r"[a-z][a-z-]*", name):
+        raise UsageError(
+            f"--sbatch {item!r} is not OPTION=VALUE", "write --sbatch account=NAME, for example"
+        )
+    return name, value
 
 
 def _queue_of(session: StageSession, found: "Plan", options: ClusterOptions) -> "Queue":
@@ -245,4 +265,5 @@ def cancel(session: StageSession, found: "Plan", options: ClusterOptions) -> Non
     if session.as_json:
         out.print_json("cancel", {"table": found.table.name, "jobs": len(there)})
         return
-    out.print_note(f"{len(there)} jobs cancelled; those that ran leave a checkpoint")
+    after = "; those that ran leave a checkpoint" if there else ""
+    out.print_note(f"{len(there)} jobs cancelled{after}")

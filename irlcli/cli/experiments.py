@@ -79,7 +79,7 @@ def plan(
     resumed. BLOCKED: waits for other steps. Nothing is computed, written or moved.
     """
     if to not in (None, "snakemake"):
-        raise UsageError(f"unknown --to {to!r}", "snakemake")
+        raise UsageError(f"unknown --to {to!r}", "the only engine is snakemake")
     if to is not None and session.as_json:
         raise UsageError("--to prints no JSON", "omit --json or --to")
     choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
@@ -194,33 +194,25 @@ def run(
     --cluster the processes are jobs; --status and --cancel are about those of the same table.
     """
     choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
-    if session.dry_run:
-        _print_plan(session, choice, open_plan(session, choice))
-        return
-    if tag is None and (session.file or session.overrides or choose_penalty is not None):
-        raise UsageError(
-            "--settings, --set and --choose-penalty make other artefacts than the profile alone",
-            "name them: --tag NAME",
-        )
-    if only is not None and (until is not None or directory is not None):
-        raise UsageError("--only takes no --until and no --out", "it makes one step")
-    if until is not None and directory is not None:
-        raise UsageError("--until makes no report, so --out has no files", "omit one of them")
-    if only is not None and cluster is not None:
-        raise UsageError("--only makes one step, in this process", "omit --cluster or --only")
     options = ClusterOptions(
         cluster, partition, time, cpus, array_parallelism, sbatch, requeues, jobs
     )
+    _check_options(session, choice, directory, options)
     options.check_used(detach)
     if status + cancel + detach > 1:
         raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
+    if session.dry_run and (status or cancel):
+        raise UsageError(
+            "--dry-run shows the plan, not the jobs", "omit --dry-run, or --status and --cancel"
+        )
     runner = session.runner()
     found = open_plan(session, choice)
+    if session.dry_run:
+        _print_plan(session, choice, found)
+        return
     if status or cancel:
         (cluster_jobs.print_status if status else cluster_jobs.cancel)(session, found, options)
         return
-    if directory is not None:
-        check_out(directory, runner.store.root)
     runner.store.create()
     with session.reading():
         if only is not None:
@@ -240,6 +232,30 @@ def run(
     if session.as_json and until is not None:
         counts = {field: len(getattr(outcome, field)) for field in ("existed", "copied", "made")}
         out.print_json("run", {"table": table, **counts})
+
+
+def _check_options(
+    session: StageSession, choice: Choice, directory: Path | None, options: ClusterOptions
+) -> None:
+    """Refuse options that contradict each other, or would be ignored, before any work.
+
+    Raises:
+        UsageError: names them.
+    """
+    other = session.file or session.overrides or choice.choose_penalty is not None
+    if choice.tag is None and other:
+        raise UsageError(
+            "--settings, --set and --choose-penalty make other artefacts than the profile alone",
+            "name them: --tag NAME",
+        )
+    if choice.only is not None and (choice.until is not None or directory is not None):
+        raise UsageError("--only takes no --until and no --out", "it makes one step")
+    if choice.until is not None and directory is not None:
+        raise UsageError("--until makes no report, so --out has no files", "omit one of them")
+    if choice.only is not None and options.cluster is not None:
+        raise UsageError("--only cannot be combined with --cluster", "omit one of them")
+    if directory is not None:
+        check_out(directory, session.store.root)
 
 
 def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str) -> None:

@@ -101,13 +101,18 @@ def _stage_session(
         profile=profile,
         file=settings,
         overrides=overrides,
-        sources=sources or _places(os.environ.get("IRL_FROM", "")),
+        sources=sources or sources_of_environment(),
         dry_run=dry_run,
         wait=wait,
         workers=workers,
         quiet=quiet,
         tensorboard=tensorboard,
     )
+
+
+def sources_of_environment() -> list[str]:
+    """The stores that ``IRL_FROM`` names."""
+    return _places(os.environ.get("IRL_FROM", ""))
 
 
 def _places(text: str) -> list[str]:

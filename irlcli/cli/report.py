@@ -15,7 +15,7 @@ from irlcli.cli.experiments import (
     Seeds,
     TableFile,
 )
-from irlcli.cli.options import Name, stage_command
+from irlcli.cli.options import Name, sources_of_environment, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.tables import (
     check_out,
@@ -87,13 +87,11 @@ def report(
     match kind:
         case "returns":
             if not refs:
-                raise UsageError(
-                    "refs are missing: no evaluation is named", "irl report returns REF..."
-                )
+                raise UsageError("name at least one evaluation", "irl report returns REF...")
             _refuse(kind, options | _of_stages(session))
             _returns(session, refs)
         case "table2":
-            _refuse(kind, options, "--format")
+            _refuse(kind, options | _of_stages(session), "--format", "--profile", "--settings")
             _table2(session, form)
         case _:
             chosen = Choice(kind, seeds, methods, rows, choose_penalty, file=file)
@@ -118,6 +116,8 @@ def _of_stages(session: StageSession) -> dict[str, Any]:
         "--profile": None if session.profile == DEFAULT_PROFILE else session.profile,
         "--settings": session.file,
         "--set": session.overrides or None,
+        # IRL_FROM is about every command, also about those that copy nothing.
+        "--from": session.sources if session.sources != sources_of_environment() else None,
         "--dry-run": session.dry_run or None,
         "--workers": None if session.workers == 1 else session.workers,
         "--tensorboard": session.tensorboard,

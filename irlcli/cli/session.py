@@ -88,6 +88,7 @@ class StageSession(base.StageSession):
         quiet: bool,
         tensorboard: Path | None,
     ):
+        _check_repeated(overrides)
         super().__init__(
             store,
             out.TerminalConsole(quiet, tensorboard),
@@ -153,9 +154,7 @@ class StageSession(base.StageSession):
         read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
         for item in self.overrides:
             if item.partition(".")[0].strip() not in read:
-                self.console.warn(
-                    f"--set {item} changes nothing: it is read by no stage of this command"
-                )
+                self.console.warn(f"no stage of this command reads --set {item}")
 
     def prepare(self, request: "Request", then: str) -> Artefact | None:
         """The artefact of ``request``, not printed.
@@ -199,6 +198,18 @@ class StageSession(base.StageSession):
             "outputs": [output.path for output in artefact.manifest.outputs],
         }
         out.print_json("artefact", document | dict(details(artefact) if details else {}))
+
+
+def _check_repeated(overrides: Sequence[str]) -> None:
+    """Refuse a field that ``--set`` names twice: only the last value would count.
+
+    Raises:
+        UsageError: naming the field.
+    """
+    fields = [item.partition("=")[0].strip() for item in overrides]
+    for field in fields:
+        if fields.count(field) > 1:
+            raise UsageError(f"--set {field} is given twice", f"give {field} once")
 
 
 def _stages(request: "Request") -> Iterator[str]:

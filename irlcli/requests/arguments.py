@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from irlcli.stages.base import Source
     from irlcli.store import Store
 
+PENALTY_WEIGHT = "airl.penalty_weight"
+
 
 def named_settings(
     env: str,
@@ -58,6 +60,9 @@ def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
                 f"write {text}=VALUE,VALUE",
             )
         return parse_settings(env, f"{text}={','.join(values)}")
+    if origin is None and not text.strip():
+        option = "--ood" if kind == "ood" else "--intervention"
+        raise UsageError(f"{option} is empty", f"write {option} KNOB=VALUE,VALUE")
     if origin is None and not text[:1].isalpha():
         raise UsageError(
             f"{text!r} names no knob of {env}",
@@ -249,6 +254,24 @@ def weights(text: str) -> list[float] | Literal["own"]:
             f"--choose-penalty {text!r} is not a list of numbers from 0 up",
             "write 0.1,1,10, or own for those of each penalty",
         ) from None
+
+
+def weights_set(overrides: Sequence[str]) -> list[str]:
+    """Those of ``--set`` that set lambda of AIRL."""
+    return [item for item in overrides if item.partition("=")[0].strip() == PENALTY_WEIGHT]
+
+
+def check_chosen(choose_penalty: str | None, overrides: Sequence[str]) -> None:
+    """Refuse ``--set airl.penalty_weight`` beside ``--choose-penalty``, which would replace it.
+
+    Raises:
+        UsageError: names both.
+    """
+    given = weights_set(overrides)
+    if choose_penalty is not None and given:
+        raise UsageError(
+            f"--set {given[-1]} and --choose-penalty both set lambda", "give one of them"
+        )
 
 
 def method_fields(

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from irlcli.experiments.status import Step
     from irlcli.experiments.tables import Table
 
-_WEIGHT = "airl.penalty_weight"
 # In a name, which may have 100 characters in all.
 _LONGEST_PART = 50
 
@@ -91,6 +90,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
             raise UsageError(
                 f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
             )
+        arguments.check_chosen(choice.choose_penalty, session.overrides)
         candidates = arguments.weights(choice.choose_penalty)
     tag = _tag(table, session.profile) if choice.tag is None else choice.tag
     try:
@@ -118,7 +118,7 @@ def _tag(table: "Table", profile: str) -> str:
 def _check_weights(session: StageSession, table: "Table") -> None:
     """Refuse a lambda for all methods where the table lists one for some of them."""
     listed = [method for method in table.methods if method in table.penalty_weights]
-    given = [f"--set {o}" for o in session.overrides if o.partition("=")[0].strip() == _WEIGHT]
+    given = [f"--set {item}" for item in arguments.weights_set(session.overrides)]
     if session.file is not None:
         knobs = {row.knob for row in table.rows}
         for source, values in in_profile(
@@ -134,12 +134,12 @@ def _check_weights(session: StageSession, table: "Table") -> None:
 
 def _weights_in(tree: Mapping[str, Any], knobs: Set[str]) -> Iterator[str]:
     """The fields of a valid settings file that set lambda, for all interventions or for one of ``knobs``."""
-    section, _, field = _WEIGHT.partition(".")
+    section, _, field = arguments.PENALTY_WEIGHT.partition(".")
     if field in tree.get(section, {}):
-        yield _WEIGHT
+        yield arguments.PENALTY_WEIGHT
     for knob, listed in tree.get("interventions", {}).items():
         if knob in knobs and field in listed.get(section, {}):
-            yield f"interventions.{knob}.{_WEIGHT}"
+            yield f"interventions.{knob}.{arguments.PENALTY_WEIGHT}"
 
 
 def _words(text: str) -> list[str]:

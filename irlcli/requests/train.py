@@ -71,6 +71,7 @@ def train_airl(
             raise UsageError(
                 "--penalty-weight and --choose-penalty both set lambda", "give one of them"
             )
+        arguments.check_chosen(choose_penalty, session.overrides)
         weights = arguments.weights(choose_penalty)
         request = choice.request(source, env, settings, airl, config.evaluation, weights, seed)
         made = session.prepare(request, "train-airl")

@@ -161,17 +161,31 @@ def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):
         (["--status", "--time", "60"], "--cluster slurm"),
         (["--array-parallelism", "2"], "--cluster slurm"),
         (["--requeues", "0"], "--cluster slurm"),
-        (["--cluster", "local", "--partition", "long"], "--partition is about Slurm"),
-        (["--cluster", "local", "--cpus", "1"], "--cpus is about Slurm"),
-        (["--cluster", "local", "--array-parallelism", "9"], "--array-parallelism is about"),
-        (["--cluster", "local", "--sbatch", "mem=4G"], "--sbatch is about Slurm"),
+        (["--cluster", "local", "--partition", "long"], "--partition needs --cluster slurm"),
+        (["--cluster", "local", "--cpus", "1"], "--cpus needs --cluster slurm"),
+        (
+            ["--cluster", "local", "--array-parallelism", "9"],
+            "--array-parallelism needs --cluster slurm",
+        ),
+        (["--cluster", "local", "--sbatch", "mem=4G"], "--sbatch needs --cluster slurm"),
         (["--status", "--cancel"], "exclude each other"),
         (["--cluster", "local", "--time", "soon"], "4:00:00"),
         (["--cluster", "slurm", "--sbatch", "account"], "account=NAME"),
+        (["--cluster", "slurm", "--sbatch", "array=1-9"], "use --array-parallelism"),
+        (["--cluster", "slurm", "--sbatch", "time=60"], "use --time"),
+        (["--cluster", "slurm", "--sbatch", "no-requeue"], "use --requeues 0"),
+        (["--cluster", "slurm", "--sbatch", "dependency=singleton"], "omit dependency"),
+        (["--cluster", "slurm", "--only", "x"], "--only cannot be combined with --cluster"),
+        (["--dry-run", "--cancel"], "--dry-run shows the plan"),
+        (["--dry-run", "--detach"], "--cluster slurm"),
+        (["--dry-run", "--partition", "long"], "--cluster slurm"),
+        (["--dry-run", "--set", "airl.bc_epochs=3"], "--tag NAME"),
+        (["--dry-run", "--out", "runs/results"], "lies in the store"),
     ],
 )
 def test_what_is_wrong_is_said_before_anything_starts(irl, tmp_path, words, said, monkeypatch):
     monkeypatch.setattr("shutil.which", lambda command: f"/bin/{command}")
+    monkeypatch.chdir(tmp_path)
     done = irl("run", "table1", "--profile", "smoke", "--store", tmp_path / "runs", *words)
     assert done.code == 2 and said in done.err, done.err
     assert not list((tmp_path / "runs").glob(".jobs/*"))

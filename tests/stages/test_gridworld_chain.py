@@ -250,7 +250,7 @@ SIZE = ["--set", "gridworld.size=1024"]
         (["transfer", "--reward", "learned", "--ood", "blocked=1"], "is a tabular-reward"),
         (["report", "figure5"], "unknown report"),
         (["report", "figure2", "demos"], "no references"),
-        (["report", "returns"], "refs are missing"),
+        (["report", "returns"], "name at least one evaluation"),
         (["report", "figure2", "--set", "figure2.episodes=[1,2]"], "2 episode counts"),
     ],
 )

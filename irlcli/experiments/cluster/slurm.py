@@ -122,7 +122,10 @@ class Slurm:
         form = "%i|%T|%R"
         done = _say("squeue", "--noheader", "--array", f"--name={JOB_NAME}", f"--format={form}")
         if done.returncode != 0:
-            raise StageFailed(f"squeue: {_reason(done.stderr)}", "is the controller up?")
+            raise StageFailed(
+                f"squeue does not answer: {_reason(done.stderr)}",
+                "look at `scontrol ping`; the controller may be down",
+            )
         rows = (line.split("|", 2) for line in done.stdout.splitlines())
         return {row[0]: " ".join(row[1:]) for row in rows if len(row) == 3}
 
