@@ -64,7 +64,8 @@ class Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
         name, _, rest = super().resolve_command(ctx, args)
         command = None if name is None else _load(name)
-        if command is not None:
+        # The shell completes a line that may be wrong.
+        if command is not None and not ctx.resilient_parsing:
             _refuse_repeated(command, rest)
         return name, command, rest
 

@@ -50,10 +50,15 @@ def snakefile(
             inputs=f"    input: {inputs}\n" if inputs else "",
             output=_done(name),
             # Snakemake replaces what stands in braces.
-            command=json.dumps(shlex.join(command(name)).replace("{", "{{").replace("}", "}}")),
+            command=_text(shlex.join(command(name)).replace("{", "{{").replace("}", "}}")),
         )
     return text
 
 
 def _done(name: str) -> str:
-    return json.dumps(f"done/{name}")
+    return _text(f"done/{name}")
+
+
+def _text(text: str) -> str:
+    """``text`` as a Python string. JSON's escapes of characters beyond 16 bits are not Python's."""
+    return json.dumps(text, ensure_ascii=False)

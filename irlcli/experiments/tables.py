@@ -21,6 +21,8 @@ Measure = Literal["transfer", "from-student", "zero-shot", "transfer-id", "id", 
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 _NAME = r"[a-z][a-z0-9-]{0,30}"
 _DEFAULTS = "defaults"
+# What `irl report` writes without a table.
+_REPORTS = ("returns", "table2")
 _LARGEST = 1e300
 # What every comparison lists, or a file's defaults.
 _COMPARING = ("rows", "methods", "seeds", "measures")
@@ -84,6 +86,7 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
     Raises:
         UsageError: not TOML; an unknown field, kind, environment, knob, method or measure; a
             missing field. The message names the file and the field.
+        NotFound: a row's file does not exist.
     """
     path = path or default_file()
     try:
@@ -94,8 +97,8 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
     try:
         _check_fields(defaults, _DEFAULTS, ("methods", "seeds"))
         return {name: _table(name, value, defaults, path.parent) for name, value in tree.items()}
-    except UsageError as error:
-        raise UsageError(f"{path}: {error.message}", error.hint) from None
+    except (UsageError, NotFound) as error:
+        raise type(error)(f"{path}: {error.message}", error.hint) from None
 
 
 def load_table(name: str, path: Path | None = None) -> Table:
@@ -180,6 +183,8 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
             f"{name!r} cannot be the name of a table",
             "a lowercase letter, then up to 30 lowercase letters, digits and '-'",
         )
+    if name in _REPORTS:
+        raise UsageError(f"{name!r} is a report of its own", "give the table another name")
     fields = [*(f for f in Table.__struct_fields__ if f != "name"), "base"]
     _check_fields(value, name, fields)
     kind = _one_of(f"{name}.kind", value.get("kind", "comparison"), get_args(Kind))

@@ -91,7 +91,7 @@ class Lab:
     def collect_experts(
         self,
         env: str | Path,
-        intervention: str | None = None,
+        intervention: str | Sequence[str] | None = None,
         *,
         setting: str | Sequence[str] = (),
         expert: Mapping[str, Ref] | None = None,
@@ -116,7 +116,7 @@ class Lab:
         """
         options: dict[str, Any] = {
             "env": str(env),
-            "intervention": intervention,
+            "intervention": joined(intervention),
             "setting": listed(setting),
             "expert": [f"{where}={self._ref(who)}" for where, who in (expert or {}).items()],
             "trust": trust,
@@ -134,7 +134,7 @@ class Lab:
         self,
         recordings: str | Path | Sequence[str | Path],
         env: str | Path,
-        intervention: str | None = None,
+        intervention: str | Sequence[str] | None = None,
         *,
         setting: str | Sequence[str] = (),
         setting_column: str | None = None,
@@ -157,7 +157,7 @@ class Lab:
         sources = [str(source) for source in listed(recordings)]
         options: dict[str, Any] = {
             "env": str(env),
-            "intervention": intervention,
+            "intervention": joined(intervention),
             "setting": listed(setting),
             "setting_column": setting_column,
             "cut": cut,
@@ -255,9 +255,9 @@ class Lab:
     def transfer(
         self,
         reward: Ref,
-        ood: str | None = None,
+        ood: str | Sequence[str] | None = None,
         *,
-        intervention: str | None = None,
+        intervention: str | Sequence[str] | None = None,
         setting: str | Sequence[str] = (),
         algorithm: str | None = None,
         start: str = "scratch",
@@ -281,8 +281,8 @@ class Lab:
         """
         options: dict[str, Any] = {
             "reward": self._ref(reward),
-            "ood": ood,
-            "intervention": intervention,
+            "ood": joined(ood),
+            "intervention": joined(intervention),
             "setting": listed(setting),
             "algorithm": algorithm,
             "start": start,
@@ -296,14 +296,14 @@ class Lab:
     def evaluate(
         self,
         policy: Ref | None = None,
-        ood: str | None = None,
+        ood: str | Sequence[str] | None = None,
         *,
         expert: bool = False,
         trained_in: str | None = None,
         random: bool = False,
         idle: bool = False,
         reward: Ref | None = None,
-        intervention: str | None = None,
+        intervention: str | Sequence[str] | None = None,
         setting: str | Sequence[str] = (),
         env: str | Path | None = None,
         episodes: int | None = None,
@@ -332,8 +332,8 @@ class Lab:
             "random": random,
             "idle": idle,
             "reward": None if reward is None else self._ref(reward),
-            "ood": ood,
-            "intervention": intervention,
+            "ood": joined(ood),
+            "intervention": joined(intervention),
             "setting": listed(setting),
             "env": None if env is None else str(env),
             "episodes": None if episodes is None else whole("episodes", episodes, 1),

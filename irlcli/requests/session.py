@@ -20,6 +20,20 @@ if TYPE_CHECKING:
     from irlcli.stages.base import Request
 
 
+def check_path(path: Path, option: str) -> None:
+    """Refuse a path that ``option`` named and that no artefact could record.
+
+    Raises:
+        UsageError: it is not UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise UsageError(
+            f"the path {str(path)!r} is not UTF-8", f"name another one with {option}"
+        ) from None
+
+
 class Session:
     """The store that artefacts are looked up in.
 
@@ -30,7 +44,7 @@ class Session:
         read_only: nothing is written to the store.
 
     Raises:
-        UsageError: ``store`` is a URL.
+        UsageError: ``store`` is a URL, or not UTF-8.
     """
 
     def __init__(
@@ -42,6 +56,7 @@ class Session:
                 f"the store {store} is a URL, not a directory",
                 "--from reads a store behind a URL; `irl push` and `irl pull` copy artefacts",
             )
+        check_path(store, "--store")
         self.console = console
         self.store = Store(store, console.warn, read_only)
         self.wait = wait

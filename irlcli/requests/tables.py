@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from irlcli.configs.load import in_profile, read_toml
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
-from irlcli.requests.session import StageSession
+from irlcli.requests.session import StageSession, check_path
 
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
@@ -73,6 +73,8 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     from irlcli.experiments.rows import PHASES
     from irlcli.experiments.tables import load_table, narrowed
 
+    if choice.file is not None:
+        check_path(choice.file, "--experiments")
     table = load_table(choice.table, choice.file)
     table = narrowed(
         table,

@@ -363,3 +363,14 @@ def test_an_unknown_stage_lists_those_there_are(irl, store_copy):
     result = irl(*arguments("ls --stage train-ariel", store_copy.path))
     assert (result.code, result.out) == (0, "")
     assert "'train-ariel'" in result.err and "train-airl, " in result.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["ls", "--store", os.fsdecode(b"s\xff")],
+        ["plan", "small", "--experiments", os.fsdecode(b"t\xff.toml")],
+    ],
+)
+def test_a_path_that_is_not_utf_8_is_refused_before_the_work(irl, words):
+    assert_answered(irl(*words), 2, "is not UTF-8")

@@ -4,8 +4,11 @@ import re
 import shlex
 
 import pytest
+import typer
 
+from irlcli.cli.app import app
 from irlcli.cli.session import StageSession
+from irlcli.errors import UsageError
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
@@ -217,6 +220,16 @@ def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):
     item = "evaluation.episodes=2"
     done = irl(*line, "--set", item, *SMOKE, "--store", store_copy.path)
     assert done.code == 0 and "reads --set" not in done.err
+
+
+def test_a_line_that_is_wrong_can_be_completed():
+    group = typer.main.get_command(app)
+    context = group.make_context("irl", ["plan"], resilient_parsing=True)
+    line = ["plan", "demo", "--rows", "ant", "--rows", ""]
+    assert group.resolve_command(context, line)[0] == "plan"
+    context.resilient_parsing = False
+    with pytest.raises(UsageError, match="--rows is given twice"):
+        group.resolve_command(context, line)
 
 
 def test_stray_arguments_are_no_lists_where_no_list_is_given(irl):

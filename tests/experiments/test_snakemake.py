@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shlex
@@ -55,6 +56,12 @@ def test_each_step_is_a_rule_that_runs_its_command_after_what_it_needs(planned):
 def test_braces_in_a_command_are_no_wildcards():
     text = snakefile({"a": ()}, lambda name: ["irl", "--set", "x={y}"], "irl plan")
     assert "x={{y}}" in text
+
+
+def test_a_path_is_written_as_it_is():
+    text = snakefile({"a": ()}, lambda name: ["irl", "--store", "st 🚀"], "irl plan")
+    (command,) = re.findall(r"shell: (.*)", text)
+    assert ast.literal_eval(command) == "irl --store 'st 🚀'"
 
 
 def test_names_that_differ_in_signs_only_have_rules_of_their_own():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from irlcli.configs import load_config
-from irlcli.errors import UsageError
+from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.tables import load_table, load_tables, narrowed
 
 SOUND = """
@@ -107,6 +107,9 @@ def test_a_table_overrides_the_defaults(tables):
         ('"Mine"', '"Mine"\nretrainings = 0', "mine.retrainings: 0 is not a count", "from 1"),
         ('"Mine"', '"Mine"\nretrainings = true', "mine.retrainings: True is not a", "from 1"),
         ("[0, 1]", "[0, 1]\nretrainings = 2", "defaults has no field 'retrainings'", "known"),
+        ("[mine]", "[table2]", "'table2' is a report of its own", "another name"),
+        ("[mine]", "[returns]", "'returns' is a report of its own", "another name"),
+        ("ant.leg-length", "none.toml.mass", "none.toml", "environment"),
         ("[mine]", "[Mine]", "'Mine' cannot be the name of a table", "lowercase"),
         ('"Mine"', "3", "mine.title: 3 is not text", "quotes"),
         ('"Mine"', '"Mine"\nkind = "expert"', "mine.kind: unknown 'expert'", "'experts'"),
@@ -123,7 +126,7 @@ def test_a_table_overrides_the_defaults(tables):
 )
 def test_a_mistake_is_named_with_its_file_and_field(tables, tmp_path, old, new, message, hint):
     assert old in SOUND
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises((UsageError, NotFound)) as caught:
         tables(SOUND.replace(old, new, 1))
     assert str(tmp_path / "experiments.toml") in caught.value.message
     assert message in caught.value.message and "\n" not in caught.value.message

@@ -101,6 +101,13 @@ def test_tables_are_data_frames(lab, irl, store_copy):
         _ = experts.id
 
 
+def test_settings_may_be_lists(lab):
+    both = lab.evaluate(idle=True, env="lunar-lander", ood=["engine-power=1.5x", "2x"])
+    assert [one.id for one in both] == [
+        one.id for one in lab.evaluate(idle=True, env="lunar-lander", ood="engine-power=1.5x,2x")
+    ]
+
+
 def test_a_plan_says_what_irl_plan_says(lab, irl):
     choice = {"seeds": [0], "methods": ["irm"], "rows": "lunar-lander"}
     new = lab.store.parent / "new"
