@@ -95,10 +95,17 @@ _KINDS = {
 }
 
 
+_BOUNDS = {">=": "of at least", ">": "above", "<=": "of at most", "<": "below"}
+
+
 def of_types(message: str) -> str:
-    """msgspec's message about a value of another type, in the words of a settings file."""
+    """msgspec's message about a value's type or range, in the words of a settings file."""
     import re
 
+    bound = re.match("Expected `(int|float)` (>=|>|<=|<) (.+)$", message)
+    if bound is not None:
+        kind, sign, number = bound.groups()
+        return f"expected {_KINDS[kind]} {_BOUNDS[sign]} {number.removesuffix('.0')}"
     found = re.match("Expected `([^`]+)`, got `([^`]+)`$", message)
     if found is None:
         return message

@@ -717,4 +717,4 @@ def test_sac_is_refused_for_discrete_actions_and_for_a_student():
         transfer.request(learned, "lunar-lander", bounce, sac)
     with pytest.raises(UsageError, match="--start student needs PPO") as started:
         transfer.request(learned, ENV, UNSEEN, sac, start=From(airl(in_use()), "policy.pt"))
-    assert discrete.value.hint == started.value.hint == "--algorithm ppo"
+    assert discrete.value.hint == started.value.hint == "use --algorithm ppo"

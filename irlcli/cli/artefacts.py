@@ -53,7 +53,8 @@ def ls(
     found.sort(key=lambda item: (item["stage"], item["about"], item["id"]))
     if stage is not None and not found:
         known = sorted({artefact.manifest.record.stage for artefact in stored})
-        session.console.warn(f"no artefact is of stage {stage!r}; stored are: {', '.join(known)}")
+        there = f"stored are: {', '.join(known)}" if known else f"{store.root} holds none"
+        session.console.warn(f"no artefact is of stage {stage!r}; {there}")
     if session.as_json:
         out.print_json("artefacts", {"artefacts": found, "newer": sorted(index.newer)})
         return

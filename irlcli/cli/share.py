@@ -130,7 +130,7 @@ def _share(
         console.close()
     for name, holder in shared.taken.items():
         console.warn(
-            f"the name {name!r} was not copied: in {target.root} it names {holder}, and keeps it"
+            f"{target.root} already uses the name {name!r} for {holder}, so {name!r} was not copied"
         )
     for id16, holder in shared.diverged.items():
         console.warn(

@@ -204,11 +204,11 @@ def relevant_transfer(
         transfer = replace(transfer, restart_episodes=_RESTART_EPISODES)
     if transfer.algorithm == "sac":
         if discrete_actions:
-            raise UsageError("SAC needs continuous actions", "--algorithm ppo")
+            raise UsageError("SAC needs continuous actions", "use --algorithm ppo")
         if from_student:
             raise UsageError(
                 "--start student needs PPO: a student's network is no actor of SAC",
-                "--algorithm ppo",
+                "use --algorithm ppo",
             )
         sac = transfer.sac
         if not sac.net_arch:

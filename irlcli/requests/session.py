@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from irlcli.errors import NotFound, UsageError
+from irlcli.errors import RETRY, NotFound, StageFailed, UsageError
 from irlcli.store import Artefact, Store
 
 DEFAULT_STORE, DEFAULT_PROFILE = Path("runs"), "standard"
@@ -87,7 +87,12 @@ class Session:
 
     def name(self, name: str, artefact: Artefact) -> None:
         """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
-        before = self.store.set_name(name, artefact)
+        try:
+            before = self.store.set_name(name, artefact)
+        except OSError as error:
+            raise StageFailed(
+                f"the store {self.store.root} cannot be written: {error.strerror or error}", RETRY
+            ) from None
         if before is not None:
             self.console.warn(f"{name} no longer names {before}")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from answers import LANDER, Done, arguments, assert_answered, flip_last, halve, snapshot
 
-from irlcli.store import Store
+from irlcli.store import Store, references
 
 # Damaged artefacts
 
@@ -374,3 +374,13 @@ def test_an_unknown_stage_lists_those_there_are(irl, store_copy):
 )
 def test_a_path_that_is_not_utf_8_is_refused_before_the_work(irl, words):
     assert_answered(irl(*words), 2, "is not UTF-8")
+
+
+def test_a_name_in_a_store_that_cannot_be_written(irl, empty_store, publish, monkeypatch):
+    def refuse(path, data):
+        raise OSError(errno.EROFS, "Read-only file system", f"{path}.temporary")
+
+    monkeypatch.setattr(references, "write_durably", refuse)
+    done = irl("name", publish(empty_store).artefact.id, "best", "--store", empty_store.root)
+    assert_answered(done, 1, f"the store {empty_store.root} cannot be written: Read-only file")
+    assert "temporary" not in done.err

@@ -66,6 +66,24 @@ def test_a_bounded_field_names_its_bounds(irl, smoke_store, item, hint):
 
 
 @pytest.mark.parametrize(
+    ("item", "message"),
+    [
+        ("airl.ppo.n_envs=70000", "expected a whole number of at most 1024"),
+        ("airl.learning_rate=-1", "expected a number above 0"),
+        ("airl.penalty_weight=-1", "expected a number of at least 0"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_in_plain_words(irl, tmp_path, item, message):
+    done = irl("plan", "demo", "--set", item, "--store", tmp_path)
+    assert done.code == 2 and done.err.splitlines()[0] == f"error: --set {item}: {message}"
+
+
+def test_a_stage_of_an_empty_store(irl, empty_store):
+    done = irl("ls", "--stage", "transfer", "--store", empty_store.root)
+    assert done.code == 0 and f"'transfer'; {empty_store.root} holds none" in done.err
+
+
+@pytest.mark.parametrize(
     ("text", "hint"),
     [
         ("0-2", "write 0,1,2"),

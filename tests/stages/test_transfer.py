@@ -187,13 +187,13 @@ def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
     lander = ["transfer", "--reward", "airl", "--ood", "1.5x", *common(store_copy.path)]
     own = ["transfer", "--reward", "airl", "--ood", "friction", *common(runs)]
     for arguments, message, hint in (
-        ([*lander, "--algorithm", "sac"], "SAC needs continuous actions", "--algorithm ppo"),
+        ([*lander, "--algorithm", "sac"], "SAC needs continuous actions", "use --algorithm ppo"),
         ([*own, "--algorithm", "sca"], "unknown transfer.algorithm 'sca'", "did you mean 'sac'"),
         ([*own, "--start", "studnet"], "unknown --start 'studnet'", "did you mean 'student'"),
         (
             [*own, "--start", "student", "--algorithm", "sac"],
             "--start student needs PPO",
-            "--algorithm ppo",
+            "use --algorithm ppo",
         ),
         ([*own, "--set", "transfer.ceiling=1.5"], "transfer.ceiling", "none"),
         ([*own, "--intervention", "friction"], "--ood and --intervention both", "give one of"),

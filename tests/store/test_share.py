@@ -84,7 +84,7 @@ def test_a_name_never_moves(irl, store, chain, place, publish, tmp_path):
     theirs.set_name("demos", own)
     pulled = irl("pull", "irm-0", "--from", place, "--store", theirs.root)
     assert pulled.code == 0
-    assert f"'demos' was not copied: in {theirs.root} it names {own.id}" in pulled.err
+    assert f"{theirs.root} already uses the name 'demos' for {own.id}" in pulled.err
     assert theirs.names() == {"demos": own.id, "irm-0": chain["airl"].id}
     # Nor does that of the place, when the other store is pushed to it.
     assert push(theirs, place, own).taken == {"demos": chain["demos"].id}
