@@ -280,7 +280,7 @@ def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path
     copy = tmp_path / "runs"
     shutil.copytree(table_store, copy, symlinks=True)
     before = Path(report("table1", copy, *ROW).out.strip())
-    other = [*SMALL, "--set", "airl.total_steps=1024"]
+    other = [w.replace("airl.total_steps=2048", "airl.total_steps=1024") for w in SMALL]
     more = ["--store", copy, "--profile", "smoke", "--quiet", *other]
     made = irl("train-airl", "--demos", "demos", "--method", "irm", "--seed", "0", *more)
     assert made.code == 0, made.err
