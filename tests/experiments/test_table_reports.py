@@ -481,7 +481,8 @@ def test_returns_of_runs_that_differ_are_not_one_row(irl, table_store):
     common = ["--store", table_store, "--profile", "smoke", *SMALL]
     pooled = irl("report", "returns", "erm.0.zero", "erm.1.zero", "--store", table_store)
     assert pooled.code == 0, pooled.err
-    longer = [*common, "--set", "airl.total_steps=4096", "--seed", "2"]
+    longer = [str(w).replace("airl.total_steps=2048", "airl.total_steps=4096") for w in common]
+    longer += ["--seed", "2"]
     assert (
         irl("train-airl", "--demos", "demos", "--method", "erm", *longer, "--name", "x").code == 0
     )
