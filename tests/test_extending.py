@@ -75,6 +75,18 @@ def test_a_penalty(irl, lab, store_copy, monkeypatch):
     assert min(values) >= 0.0 and max(values) > 0.0
 
 
+def test_a_penalty_whose_module_is_missing(irl, store_copy, monkeypatch):
+    entry = penalties.Penalty("nowhere.risk_range", ("airl",), compares=True, reads=())
+    monkeypatch.setitem(penalties.PENALTIES, "risk-range", entry)
+    line = ["train-airl", "--demos", "demos", "--grouping", "per-setting"]
+    line += ["--penalty", "risk-range", "--store", store_copy.path, "--profile", "smoke"]
+    done = irl(*line)
+    assert done.code == 1 and "nowhere.risk_range cannot be imported" in done.err
+    assert "PYTHONPATH" in done.err
+    # A stage that fails leaves no output behind, and no directory without a checkpoint.
+    assert not list((store_copy.path / ".work").iterdir())
+
+
 def test_a_learner(irl, lab, store_copy, monkeypatch):
     lab("fairl.py")
     fixes = {"policy_reward": "f-log-pi", "fixed_horizon": False}

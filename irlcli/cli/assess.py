@@ -8,6 +8,7 @@ from irlcli.cli import console as out
 from irlcli.cli.options import Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured
+from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.experiments import bank, references
 from irlcli.interventions import parse_setting
@@ -65,11 +66,13 @@ def assess(
             "no ladder of noise: the store does not hold what this reward was learned from; "
             "name demonstrations with --demos"
         )
+    own = environment(env).own
+    named = env if own is None else own.source
     missing = [str(s) for s in settings if str(s) not in policies.experts]
     for text in missing:
         session.console.warn(
             f"no expert of {text} with this config, so no regret and no expert minus idle: "
-            f"`{session.suggestion('evaluate', '--expert', '--env', env, '--setting', text)}` "
+            f"`{session.suggestion('evaluate', '--expert', '--env', named, '--setting', text)}` "
             "trains it"
         )
     request = stage.request(

@@ -49,7 +49,8 @@ def envs(
         raise UsageError(f"unknown action {action!r}", suggest(action, _ACTIONS))
     if (env is None) != (action == "list"):
         needs = "takes no environment" if action == "list" else "needs an environment"
-        raise UsageError(f"envs {action} {needs}", f"write irl envs {action} [ENV]")
+        form = "irl envs list" if action == "list" else f"irl envs {action} ENV"
+        raise UsageError(f"envs {action} {needs}", f"write {form}")
     if env is None:
         _list(session)
         return

@@ -126,7 +126,7 @@ class EnvironmentSpec(NamedTuple):
             it with each change that alters trajectories.
         transition_reward: ``module:function`` of the true reward [B] as a function of
             observations, actions and next observations, where it is one; else None.
-        unobserved: what the true reward depends on besides them, as the end of a sentence.
+        unobserved: what the true reward depends on besides them, as the end of a sentence, if known.
         needs: a library that may be missing.
         own: of an environment from outside the package; its ``entry_point`` or ``gym_id`` is empty.
     """
@@ -140,6 +140,6 @@ class EnvironmentSpec(NamedTuple):
     tabular: bool = False
     physics: int = 1
     transition_reward: str | None = None
-    unobserved: str = "an unknown quantity"
+    unobserved: str | None = None
     needs: Needs | None = None
     own: Own | None = None

@@ -240,8 +240,11 @@ class Runner:
         with checkpoints.listening():
             try:
                 request.stage.run(job)
-            except StageFailed as error:
-                raise StageFailed(f"{request.label}: {error.message}", error.hint) from error
+            except BaseException as error:
+                scratch.discard_output(output)
+                if isinstance(error, StageFailed):
+                    raise StageFailed(f"{request.label}: {error.message}", error.hint) from error
+                raise
         origin = provenance.record(self.command, self.workers, checkpoints.attempts())
         environment = described(request)
         if environment is not None:

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import StageFailed, UsageError, suggest
 from irlcli.methods import METHODS
 
 if TYPE_CHECKING:
@@ -192,10 +192,29 @@ def penalty_version(name: str) -> int | UnsetType:
 
 
 def discriminator_penalty(name: str) -> Callable[[Samples, PenaltyOptions], torch.Tensor]:
-    """The function ``discriminator`` of a penalty of adversarial learners."""
-    return import_module(PENALTIES[name].module).discriminator
+    """The function ``discriminator`` of a penalty of adversarial learners.
+
+    Raises:
+        StageFailed: its module cannot be imported.
+    """
+    return _module(name).discriminator
 
 
 def occupancy_penalty(name: str) -> Callable[[Occupancies], tuple[np.ndarray, np.ndarray]]:
-    """The function ``occupancy`` of a penalty of MaxEnt IRL."""
-    return import_module(PENALTIES[name].module).occupancy
+    """The function ``occupancy`` of a penalty of MaxEnt IRL.
+
+    Raises:
+        StageFailed: its module cannot be imported.
+    """
+    return _module(name).occupancy
+
+
+def _module(name: str) -> Any:
+    path = PENALTIES[name].module
+    try:
+        return import_module(path)
+    except ModuleNotFoundError as error:
+        raise StageFailed(
+            f"penalty {name!r}: {path} cannot be imported ({error})",
+            "install its package, or name its folder in PYTHONPATH",
+        ) from error

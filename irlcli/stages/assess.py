@@ -181,6 +181,8 @@ def _epic_distances(
     true = transition_reward(where.name)
     if true is None:
         what = environment(where.name).unobserved
+        if what is None:
+            return {}, f"{where.name} names no function of transitions as its true reward"
         return {}, f"the true reward of {where.name} also depends on {what}"
     found = {}
     for place in dict.fromkeys(entry.setting for entry in episodes):

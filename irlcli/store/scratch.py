@@ -56,6 +56,12 @@ class Scratch:
         path.mkdir()
         return path
 
+    def discard_output(self, output: Path) -> None:
+        """Remove the output of an attempt that failed, as far as the file system allows it."""
+        with suppress(OSError):
+            remove(output)
+        self.remove_if_empty()
+
     def clear(self) -> None:
         """Remove the checkpoint, and the directory unless another process uses it."""
         self.discard_checkpoint()
