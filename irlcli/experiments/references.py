@@ -50,7 +50,10 @@ def tensor_file(
 
         path = resolved.path / f"{kind}.pt" if resolved.path.is_dir() else resolved.path
         if not path.exists():
-            raise NotFound(f"{resolved.path} holds no {kind}.pt", f"name a {kind} file")
+            raise NotFound(
+                f"{ref!r} is neither an artefact nor a directory with {kind}.pt",
+                f"name an artefact or a {kind} file; `irl ls` lists the artefacts",
+            )
         description, _ = load(path, kind)
         return source_of(Resolved(None, path)), description
     introduce(artefact)
@@ -164,8 +167,13 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
     resolved = store.resolve(ref)
     artefact = resolved.artefact
     if artefact is None:
-        from irlcli.data.demonstrations import read_demonstrations
+        from irlcli.data.demonstrations import EPISODES, STEPS, read_demonstrations
 
+        if not any((Path(ref) / name).exists() for name in (EPISODES, STEPS)):
+            raise NotFound(
+                f"{ref!r} is neither an artefact nor a directory with {EPISODES}",
+                "name an artefact, or a directory of demonstrations; `irl ls` lists the artefacts",
+            )
         demos = read_demonstrations(Path(ref))
         return source_of(resolved), demos.env, list(demos.trajectories)
     introduce(artefact)
@@ -211,7 +219,15 @@ def _recorded(text: str) -> Source:
         hint = "name a Parquet file, minari:DATASET, or a directory of imitation's trajectories"
     if not path.exists():
         raise NotFound(f"there is nothing at {path}", hint)
-    return source_of(Resolved(None, path))
+    source = source_of(Resolved(None, path))
+    if path.is_file() and not _is_parquet(path):
+        raise UsageError(f"{path} is not a Parquet file", hint)
+    return source
+
+
+def _is_parquet(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(4) == b"PAR1"
 
 
 def minari_directory(dataset: str) -> Path:

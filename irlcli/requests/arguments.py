@@ -22,6 +22,7 @@ from irlcli.interventions import (
 if TYPE_CHECKING:
     from irlcli.configs import Config
     from irlcli.data.descriptions import Policy, Reward
+    from irlcli.experiments.runner import RunConsole
     from irlcli.stages.base import Source
     from irlcli.store import Store
 
@@ -105,6 +106,15 @@ def with_several(
     settings = [*listed, *added]
     check_distinct("the command", settings)
     return settings
+
+
+def warn_of_seen(
+    console: "RunConsole", settings: Sequence[Setting], origin: "Reward | Policy", ref: str
+) -> None:
+    """Warn of every setting beside ``--ood`` that ``origin``, which ``ref`` names, was trained in."""
+    for setting in settings:
+        if str(setting) in origin.settings:
+            console.warn(f"{setting} is not unseen: {ref!r} was trained in it")
 
 
 def _listed(config: "Config", knob: str, kind: Literal["id", "ood"]) -> str:

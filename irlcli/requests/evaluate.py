@@ -140,6 +140,8 @@ def _of_policy(
     settings: Sequence[Setting]
     if where.given:
         settings = where.settings(origin.env, config, origin)
+        if where.kind == "ood":
+            arguments.warn_of_seen(session.console, settings, origin, policy)
     else:
         settings = [parse_setting(origin.env, text) for text in origin.settings]
     if scored_by is not None:

@@ -50,6 +50,7 @@ def transfer(
         named = arguments.named_settings(origin.env, config, intervention, "id", origin)
     elif ood is not None:
         named = arguments.named_settings(origin.env, config, ood, "ood", origin)
+        arguments.warn_of_seen(session.console, named, origin, reward)
     settings = arguments.with_several(origin.env, named, setting, origin)
     if len(settings) != 1:
         names = ", ".join(str(setting) for setting in settings)

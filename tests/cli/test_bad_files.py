@@ -61,6 +61,24 @@ def hostile_pickles(marker: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(
+    ("line", "file"),
+    [
+        ("train-airl --demos mine", "episodes.parquet"),
+        ("transfer --ood 1.75x --reward mine", "reward.pt"),
+        ("evaluate --ood 1.75x --policy mine", "policy.pt"),
+    ],
+)
+def test_a_directory_of_the_working_directory_is_no_artefact(
+    irl, store_copy, tmp_path, monkeypatch, line, file
+):
+    monkeypatch.chdir(tmp_path)
+    Path("mine").mkdir()
+    Path("mine", "notes.txt").touch()
+    done = irl(*arguments(line, store_copy.path))
+    assert_answered(done, 3, f"'mine' is neither an artefact nor a directory with {file}")
+
+
+@pytest.mark.parametrize(
     "option", ["transfer --ood 1.75x --reward", "evaluate --ood 1.75x --policy"]
 )
 @pytest.mark.parametrize("kind", hostile_pickles(Path("x")))

@@ -167,6 +167,7 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
     )
     pq.write_table(nan, tmp_path / "nan.parquet")
     (tmp_path / "text.parquet").write_text("no parquet at all")
+    (tmp_path / "cut.parquet").write_bytes(exported.read_bytes()[:-4])
     (tmp_path / "empty").mkdir()
     pq.write_table(table.slice(0, 0), tmp_path / "none.parquet")
     other = ["--env", "lunar-lander", "--intervention", "engine-power=1x,1.5x"]
@@ -180,7 +181,8 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
         ([exported, *lone, "--setting-column", "setting"], 2, "'engine-power=1.25x' is not one of"),
         ([exported, exported, *LANDER, "--setting-column", "s"], 2, "is of one setting"),
         ([tmp_path / "nan.parquet", *LANDER], 2, f"row {len(table) - 1}: reward is not finite"),
-        ([tmp_path / "text.parquet", *LANDER], 4, "text.parquet"),
+        ([tmp_path / "text.parquet", *LANDER], 2, "text.parquet is not a Parquet file"),
+        ([tmp_path / "cut.parquet", *LANDER], 4, "cut.parquet"),
         ([tmp_path / "none.parquet", *LANDER], 2, "no episode"),
         ([tmp_path / "nowhere.parquet", *LANDER], 3, "nowhere.parquet"),
         ([tmp_path / "empty", *LANDER[:2], "--setting", "default"], 2, "empty"),

@@ -180,7 +180,15 @@ def test_a_training_setting_is_named_as_for_evaluations(runs, irl):
     by_value = irl(*own, "--intervention", "2:0.6:0.6")
     assert by_value.code == 0, by_value.err
     assert "half-cheetah friction=2:0.6:0.6" in by_value.out
-    assert by_value.out == irl(*own, "--ood", "friction=2:0.6:0.6").out
+    assert "warning" not in by_value.err
+    as_unseen = irl(*own, "--ood", "friction=2:0.6:0.6")
+    assert as_unseen.out == by_value.out
+    warned = "warning: friction=2:0.6:0.6 is not unseen: 'airl' was trained in it"
+    assert warned in as_unseen.err
+    assert "warning" not in irl(*own, "--ood", "friction").err
+    score = ["evaluate", "--policy", "airl", *common(runs), "--dry-run"]
+    assert warned in irl(*score, "--ood", "2:0.6:0.6").err
+    assert "warning" not in irl(*score).err
 
 
 def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):
