@@ -66,6 +66,20 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
     return found
 
 
+def weak_experts(cells: pd.DataFrame) -> list[str]:
+    """Experts that earn no more than the random agent, against which no verdict means anything."""
+    means = cells.set_index(["row", "measure", "agent"])["mean"]
+    found = []
+    for (row, measure), of in means.groupby(level=["row", "measure"], sort=False):
+        expert, random = (of.get((row, measure, agent)) for agent in ("expert", "random"))
+        if expert is not None and random is not None and expert <= random:
+            found.append(
+                f"Weak expert: {row}: the expert earns {expert:.1f}, no more than the random agent's "
+                f"{random:.1f}. Shares of the expert and verdicts mean nothing here."
+            )
+    return found
+
+
 def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
     """Retrained policies that fall short of the expert: a wrong reward, or failed optimisation."""
     found = []

@@ -29,6 +29,14 @@ def test_a_student_that_did_not_imitate():
     assert "80% of the expert (79.6% of the expert's return)" in marked
 
 
+@pytest.mark.parametrize(("expert", "weak"), [(99.0, True), (100.0, True), (101.0, False)])
+def test_an_expert_no_better_than_the_random_agent(expert, weak):
+    returns = complete() | {(BOUNCE, "random", "ood"): [100.0], (BOUNCE, "expert", "ood"): [expert]}
+    found = build(*example(returns), {}, {}).caveats
+    assert any(c.startswith(f"Weak expert: {BOUNCE}: ") for c in found) == weak
+    assert not any(c.startswith(f"Weak expert: {POWER}: ") for c in found)
+
+
 def test_a_saturated_discriminator():
     learning = {
         (BOUNCE, "irm", 0): metrics(0.94, 0.001, 8.0),

@@ -179,6 +179,8 @@ def test_a_policy_retrained_on_the_reward_is_judged_where_the_expert_is_known(as
     assert split["learned_gap"]["mean"] == pytest.approx(gap)
     shown = irl(*line)
     assert split["verdict"] in shown.err and "Spearman" in shown.err
+    weak = best["true"]["mean"] <= means["random"]["true"]["mean"]
+    assert ("the verdicts mean nothing" in shown.err) == weak
 
 
 def test_expert_minus_idle_counts_absorbing_steps(assessed):
