@@ -1,6 +1,5 @@
 """What options are read and requests are run with: a store, configs, and a console."""
 
-import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -10,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.errors import RETRY, NotFound, StageFailed, UsageError
-from irlcli.store import Artefact, Store
+from irlcli.store import DEFAULT_ROOT, Artefact, Store
 
-DEFAULT_STORE, DEFAULT_PROFILE = Path("runs"), "standard"
+DEFAULT_STORE, DEFAULT_PROFILE = Path(DEFAULT_ROOT), "standard"
 
 if TYPE_CHECKING:
     from irlcli.configs import Config
@@ -76,14 +75,9 @@ class Session:
             kind = "directory" if resolved.path.is_dir() else "file"
             raise NotFound(
                 f"{ref!r} is a {kind}, not an artefact of the store {self.store.root}",
-                f"`{shlex.join(['irl', 'ls', *self.store_words()])}` lists the artefacts",
+                f"`{shlex.join(['irl', 'ls', *self.store.option])}` lists the artefacts",
             )
         return resolved.artefact
-
-    def store_words(self) -> list[str]:
-        """The option that names this store on a command line, unless it is the default."""
-        root, known = self.store.root, Path(os.environ.get("IRL_STORE") or DEFAULT_STORE)
-        return [] if root == known else ["--store", str(root)]
 
     def name(self, name: str, artefact: Artefact) -> None:
         """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
@@ -157,7 +151,7 @@ class StageSession(Session):
         configs = self.config_words()
         if self.profile == DEFAULT_PROFILE:
             configs = configs[2:]
-        return shlex.join(["irl", *words, *configs, *self.store_words()])
+        return shlex.join(["irl", *words, *configs, *self.store.option])
 
     def runner(self) -> "Runner":
         """A runner on the session's store and those to copy from.

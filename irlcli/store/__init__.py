@@ -3,6 +3,7 @@
 from irlcli.store.artefact import Artefact, Published
 from irlcli.store.digest import canonical_json, digest, file_digest
 from irlcli.store.index import Index
+from irlcli.store.layout import DEFAULT_ROOT
 from irlcli.store.manifest import (
     KeyRecord,
     Manifest,
@@ -17,6 +18,7 @@ from irlcli.store.scratch import Scratch
 from irlcli.store.store import Store
 
 __all__ = [
+    "DEFAULT_ROOT",
     "Artefact",
     "Index",
     "KeyRecord",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError, NotFound, suggest
 from irlcli.store.digest import file_digest
-from irlcli.store.layout import ID_DIGITS, is_id
+from irlcli.store.layout import ID_DIGITS, Layout, is_id
 from irlcli.store.manifest import (
     MANIFEST,
     PROVENANCE,
@@ -119,11 +119,22 @@ def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[s
     return [id16 for id16, slash, _ in texts if slash and is_id(id16)]
 
 
-def recorded_command(directory: Path) -> str:
-    """The command line in a provenance that may be damaged; empty if it cannot be read."""
+def recorded_command(directory: Path, layout: Layout) -> str:
+    """The command line that made an artefact, to be repeated in the store ``layout``.
+
+    Empty if the provenance, which may be damaged, cannot be read.
+    """
     import shlex
 
     try:
-        return shlex.join(read_json(directory / PROVENANCE)["record"]["command"])
+        command = shlex.join(read_json(directory / PROVENANCE)["record"]["command"])
     except (IntegrityError, KeyError, TypeError):
         return ""
+    words = iter(shlex.split(command))
+    kept = []
+    for word in words:
+        if word == "--store":
+            next(words, None)
+        elif not word.startswith("--store="):
+            kept.append(word)
+    return shlex.join([*kept, *layout.option])

@@ -71,7 +71,7 @@ def missing(layout: Layout, index: Index) -> dict[str, Missing]:
 
     def lost(id16: str) -> Missing:
         place = quarantined(layout, id16)
-        command = "" if place is None else recorded_command(place)
+        command = "" if place is None else recorded_command(place, layout)
         return found.setdefault(id16, Missing([], [], place, command))
 
     for name, id16 in pointers.items():

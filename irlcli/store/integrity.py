@@ -95,7 +95,7 @@ def verify(
         if artefact is not None and not failed:
             sound[id16] = artefact
             continue
-        command, place = recorded_command(layout.root / id16), None
+        command, place = recorded_command(layout.root / id16, layout), None
         if not layout.read_only:
             try:
                 place = set_aside(layout, layout.root / id16)
@@ -114,7 +114,7 @@ def verify(
 def damaged(layout: Layout, directory: Path, problem: str) -> IrlError:
     """The error to raise for a damaged artefact, after moving it to quarantine."""
     name = f"artefact {directory.name}"
-    command = recorded_command(directory)
+    command = recorded_command(directory, layout)
     hint = f"compute it again: {command}" if command else "compute it again"
     try:
         directory.lstat()

@@ -46,6 +46,12 @@ class Layout(NamedTuple):
     read_only: bool = False
 
     @property
+    def option(self) -> list[str]:
+        """The words that name this store on a command line; none if it is the default."""
+        default = Path(os.environ.get("IRL_STORE") or DEFAULT_ROOT)
+        return [] if self.root == default else ["--store", str(self.root)]
+
+    @property
     def marker(self) -> Path:
         return self.root / "STORE"
 

@@ -86,8 +86,7 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     head = text.partition("/")[0]
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
-    known = "" if str(layout.root) == DEFAULT_ROOT else f" --store {shlex.quote(str(layout.root))}"
-    listing = f"`irl ls{known}` lists the artefacts"
+    listing = f"`{shlex.join(['irl', 'ls', *layout.option])}` lists the artefacts"
     close = closest(head, names(layout))
     if close is not None:
         listing = f"did you mean {close!r}? {listing}"
@@ -129,7 +128,7 @@ def _missing(layout: Layout, subject: str, id16: str) -> NotFound:
             f"{subject} is missing",
             "name another artefact with `irl name`",
         )
-    command = recorded_command(place)
+    command = recorded_command(place, layout)
     return NotFound(
         f"{subject} was damaged and is now in {place}",
         f"compute it again: {command}" if command else "compute it again",

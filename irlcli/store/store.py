@@ -92,6 +92,11 @@ class Store:
         """
         layouts.create(self._writable)
 
+    @property
+    def option(self) -> list[str]:
+        """The words that name this store on a command line; none if it is the default."""
+        return self._layout.option
+
     # Reading
 
     def find(self, key: str) -> Artefact | None:

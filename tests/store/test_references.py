@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 
 from irlcli.errors import NotFound, UsageError
 from irlcli.store import Artefact, Store
+from irlcli.store.artefact import recorded_command
+from irlcli.store.layout import Layout
 
 DAY = 86400.0
 
@@ -314,6 +317,30 @@ def test_the_name_of_a_quarantined_artefact_comes_with_the_command_that_made_it(
         empty_store.resolve("best")
     assert str(place) in caught.value.message
     assert caught.value.hint.startswith("compute it again")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--store", "elsewhere", "--seed", "1"],
+        ["--seed", "1", "--store=elsewhere"],
+        ["--seed", "1"],
+    ],
+)
+def test_a_copied_store_is_repaired_in_its_own_place(tmp_path, monkeypatch, publish, words):
+    """Not where the artefact was first made, which the recorded command names."""
+    monkeypatch.delenv("IRL_STORE", raising=False)
+    copied = Layout(tmp_path / "copied")
+    directory = publish(Store(copied.root)).artefact.directory
+    provenance = directory / "provenance.json"
+    provenance.chmod(0o644)
+    provenance.write_text(json.dumps({"record": {"command": ["irl", "transfer", *words]}}))
+    line = f"irl transfer --seed 1 --store {copied.root}"
+    assert recorded_command(directory, copied) == line
+    monkeypatch.setenv("IRL_STORE", str(copied.root))
+    assert recorded_command(directory, copied) == "irl transfer --seed 1"
+    provenance.write_text('{"record": {"command": [1]}}')
+    assert recorded_command(directory, copied) == ""
 
 
 @pytest.mark.parametrize("content", [b"", b"../../etc", b"\xff\xff", b"zzz"])

@@ -84,7 +84,7 @@ def test_verify_reports_damage_as_json(irl, empty_store, publish):
     assert list(said["damaged"]) == [artefact.id] and sound.id not in result.out
     damage = said["damaged"][artefact.id]
     assert "reward.pt" in damage["problems"][0] and "differs" in damage["problems"][0]
-    assert damage["command"] == "irl train-airl"
+    assert damage["command"] == f"irl train-airl --store {empty_store.root}"
     assert Path(damage["quarantine"], "reward.pt").exists()
 
 
