@@ -7,8 +7,6 @@ A penalty of MaxEnt IRL is a function ``occupancy(at)`` of :class:`Occupancies` 
 and its gradient by phi [R, K, S].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,12 +34,12 @@ class Samples(NamedTuple):
         slope: the mean squared gradient of g by its input, a scalar, computed when called.
     """
 
-    logits: torch.Tensor
-    f: torch.Tensor
-    risks: torch.Tensor
-    weights: torch.Tensor
-    parameters: tuple[torch.Tensor, ...] = ()
-    slope: Callable[[], torch.Tensor] | None = None
+    logits: "torch.Tensor"
+    f: "torch.Tensor"
+    risks: "torch.Tensor"
+    weights: "torch.Tensor"
+    parameters: "tuple[torch.Tensor, ...]" = ()
+    slope: "Callable[[], torch.Tensor] | None" = None
 
 
 class PenaltyOptions(NamedTuple):
@@ -71,12 +69,12 @@ class Occupancies(NamedTuple):
         weight: [R], lambda, at least 0.
     """
 
-    phi: np.ndarray
-    gap: np.ndarray
-    weights: np.ndarray
-    risks: np.ndarray
-    response: Callable[[], np.ndarray]
-    weight: np.ndarray
+    phi: "np.ndarray"
+    gap: "np.ndarray"
+    weights: "np.ndarray"
+    risks: "np.ndarray"
+    response: "Callable[[], np.ndarray]"
+    weight: "np.ndarray"
 
 
 class Penalty(NamedTuple):
@@ -191,7 +189,7 @@ def penalty_version(name: str) -> int | UnsetType:
     return UNSET if version == 1 else version
 
 
-def discriminator_penalty(name: str) -> Callable[[Samples, PenaltyOptions], torch.Tensor]:
+def discriminator_penalty(name: str) -> "Callable[[Samples, PenaltyOptions], torch.Tensor]":
     """The function ``discriminator`` of a penalty of adversarial learners.
 
     Raises:
@@ -200,7 +198,7 @@ def discriminator_penalty(name: str) -> Callable[[Samples, PenaltyOptions], torc
     return _module(name).discriminator
 
 
-def occupancy_penalty(name: str) -> Callable[[Occupancies], tuple[np.ndarray, np.ndarray]]:
+def occupancy_penalty(name: str) -> "Callable[[Occupancies], tuple[np.ndarray, np.ndarray]]":
     """The function ``occupancy`` of a penalty of MaxEnt IRL.
 
     Raises:

@@ -1,7 +1,5 @@
 """True returns of evaluations, side by side: which agent, in which setting, over which seeds."""
 
-from __future__ import annotations
-
 # math instead of statistics: a cache hit prints returns, and statistics is slow to import.
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -5,8 +5,6 @@ and cache hits import every stage module, so each imports torch, gymnasium, pyar
 inside ``run`` only.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -70,7 +68,7 @@ class Job(NamedTuple):
     console: Console
     workers: int = 1
 
-    def warn_of_errors(self, setting: str, trajectories: Sequence[Trajectory]) -> None:
+    def warn_of_errors(self, setting: str, trajectories: "Sequence[Trajectory]") -> None:
         """Name the episodes that stopped on an error."""
         for k, trajectory in enumerate(trajectories):
             if trajectory.error is not None:
@@ -99,7 +97,7 @@ class Source(NamedTuple):
 class From(NamedTuple):
     """An input that another request makes: one of its outputs, or all of them (``None``)."""
 
-    request: Request
+    request: "Request"
     output: str | None = None
 
 
@@ -177,7 +175,7 @@ def environment_key(env: str, settings: Sequence[Setting] | None = None) -> Envi
     )
 
 
-def run_training(job: Job, training: Training | Restarts) -> list[Row]:
+def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
     """Run ``training`` from the job's last checkpoint to the end; its rows.
 
     Reports every round to the job's console and offers it as a checkpoint.
@@ -199,7 +197,7 @@ def run_training(job: Job, training: Training | Restarts) -> list[Row]:
         rows = tensors.byte_tensor(json.dumps(training.rows).encode())
         return tensors.to_bytes({"training": training.state_dict(), "rows": rows})
 
-    def after_round(_: Training | Restarts, newest: list[Row]) -> None:
+    def after_round(_: "Training | Restarts", newest: "list[Row]") -> None:
         _report(job, training, newest)
         job.checkpoints.offer(encoded)
 
@@ -239,11 +237,11 @@ def run_parts(
 def frozen_reward(
     where: EnvironmentKey,
     setting: str,
-    model: RewardModule,
-    origin: Reward,
+    model: "RewardModule",
+    origin: "Reward",
     ceiling: float | None = None,
     gamma: float | None = None,
-) -> FrozenReward:
+) -> "FrozenReward":
     """The reward that was read from a ``reward.pt``, as it scores episodes in ``setting``.
 
     ``gamma`` is the discount of a policy that is trained on it; by default that of its shaping.
@@ -278,7 +276,7 @@ def shown(true_return: float, progress: float | None) -> str:
     return f"return {true_return:.0f}" + ("" if no_progress else f" progress {progress:.0f}")
 
 
-def summary_of(setting: str, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+def summary_of(setting: str, trajectories: "Sequence[Trajectory]") -> dict[str, Any]:
     """The means of ``trajectories`` in one setting, as ``summary.json`` has them."""
     import numpy as np
 
@@ -294,7 +292,7 @@ def summary_of(setting: str, trajectories: Sequence[Trajectory]) -> dict[str, An
     }
 
 
-def _report(job: Job, training: Training | Restarts, newest: list[Row]) -> None:
+def _report(job: Job, training: "Training | Restarts", newest: "list[Row]") -> None:
     facts = {row["setting"]: shown(row["true_return"], row["progress"]) for row in newest}
     if "restart" in newest[0]:
         facts["restart"] = str(newest[0]["restart"] + 1)

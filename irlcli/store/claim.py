@@ -9,8 +9,6 @@ Ages are differences between two times of the same file system, so that the cloc
 need not agree.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import threading
