@@ -219,14 +219,14 @@ def test_light_modules_import_nothing_heavy_at_their_top(name):
     assert not {n for n in found if within(n, heavy)}
 
 
-def loaded_by(*arguments):
-    """Heavy modules loaded after a command line ran in a fresh interpreter."""
+def loaded_by(*arguments, among=HEAVY | {"numpy"}):
+    """Those of the modules ``among`` that a command line loads in a fresh interpreter."""
     code = (
         "import sys\n"
         f"sys.argv = ['irl', *{list(arguments)!r}]\n"
         "from irlcli.cli.main import main\n"
         "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code, stop.code\n"
-        f"print('LOADED', sorted({HEAVY | {'numpy'}!r} & set(sys.modules)))\n"
+        f"print('LOADED', sorted({set(among)!r} & set(sys.modules)))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return done.stdout.splitlines()[-1]
@@ -242,6 +242,9 @@ def test_a_hit_loads_nothing_heavy(tmp_path):
     assert "torch" in loaded_by(*command)
     assert loaded_by(*command) == "LOADED []"
     assert loaded_by("ls", "--store", str(tmp_path / "runs")) == "LOADED []"
+    # What only reads the store loads no configs.
+    light = loaded_by("ls", "--store", str(tmp_path / "runs"), among={"msgspec", "tomllib"})
+    assert light == "LOADED []"
     assert loaded_by("verify", "--store", str(tmp_path / "runs")) == "LOADED []"
 
 

@@ -25,34 +25,12 @@ Env = Annotated[
         autocompletion=complete.environments,
     ),
 ]
-Method = Annotated[
-    str | None,
-    typer.Option(
-        help=f"One of: {', '.join(name for name, _ in complete.methods(''))}.",
-        autocompletion=complete.methods,
-    ),
-]
-MaxEntMethod = Annotated[
-    str | None,
-    typer.Option(
-        help=f"One of: {', '.join(name for name, _ in complete.maxent_methods(''))}.",
-        autocompletion=complete.maxent_methods,
-    ),
-]
-Grouping = Annotated[
-    str | None,
-    typer.Option(
-        help="Demonstrations that share a risk: pooled, balanced, per-setting or shuffled.",
-        autocompletion=complete.groupings,
-    ),
-]
 OneSetting = Annotated[
     list[str],
     typer.Option(
         "--setting", help="One setting, also of several knobs: KNOB=VALUE,KNOB=VALUE. Repeatable."
     ),
 ]
-PenaltyWeight = Annotated[float | None, typer.Option(help="Weight of the penalty, lambda.")]
 
 _Store = Annotated[Path, typer.Option(envvar="IRL_STORE", help="Artefact store.")]
 _Json = Annotated[bool, typer.Option("--json", help="Print versioned JSON on stdout.")]
@@ -112,7 +90,8 @@ def _stage_session(
 
 def sources_of_environment() -> list[str]:
     """The stores that ``IRL_FROM`` names."""
-    return _places(os.environ.get("IRL_FROM", ""))
+    text = os.environ.get("IRL_FROM")
+    return _places(text) if text else []
 
 
 def _places(text: str) -> list[str]:

@@ -6,20 +6,20 @@ import typer
 
 from irlcli.cli import complete
 from irlcli.cli import console as out
-from irlcli.cli.options import (
-    Env,
-    Grouping,
-    MaxEntMethod,
-    Method,
-    Name,
-    PenaltyWeight,
-    Seed,
-    stage_command,
-)
+from irlcli.cli.options import Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Quality
 from irlcli.experiments.references import output
 from irlcli.requests import train as requested
+
+_Grouping = Annotated[
+    str | None,
+    typer.Option(
+        help="Demonstrations that share a risk: pooled, balanced, per-setting or shuffled.",
+        autocompletion=complete.groupings,
+    ),
+]
+_PenaltyWeight = Annotated[float | None, typer.Option(help="Weight of the penalty, lambda.")]
 
 
 def _listed(learner: str) -> str:
@@ -30,13 +30,19 @@ def _listed(learner: str) -> str:
 def train_airl(
     session: StageSession,
     demos: Annotated[str, typer.Option(help="Artefact with demonstrations.")],
-    method: Method = None,
-    grouping: Grouping = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help=f"One of: {', '.join(name for name, _ in complete.methods(''))}.",
+            autocompletion=complete.methods,
+        ),
+    ] = None,
+    grouping: _Grouping = None,
     penalty: Annotated[
         str | None,
         typer.Option(help=_listed("airl"), autocompletion=complete.airl_penalties),
     ] = None,
-    penalty_weight: PenaltyWeight = None,
+    penalty_weight: _PenaltyWeight = None,
     choose_penalty: Annotated[
         str | None,
         typer.Option(
@@ -78,13 +84,19 @@ def train_airl(
 def train_maxent(
     session: StageSession,
     demos: Annotated[str, typer.Option(help="Artefact with demonstrations in a gridworld.")],
-    method: MaxEntMethod = None,
-    grouping: Grouping = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help=f"One of: {', '.join(name for name, _ in complete.maxent_methods(''))}.",
+            autocompletion=complete.maxent_methods,
+        ),
+    ] = None,
+    grouping: _Grouping = None,
     penalty: Annotated[
         str | None,
         typer.Option(help=_listed("maxent"), autocompletion=complete.maxent_penalties),
     ] = None,
-    penalty_weight: PenaltyWeight = None,
+    penalty_weight: _PenaltyWeight = None,
     l2: Annotated[float | None, typer.Option(help="Weight decay.")] = None,
     features: Annotated[str | None, typer.Option(help="learned or linear.")] = None,
     seed: Seed = 0,
