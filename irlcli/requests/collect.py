@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from irlcli.configs import Config
 from irlcli.data.descriptions import Collected
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
@@ -37,8 +38,9 @@ def collect_experts(
             "neither --intervention nor --setting names a setting",
             "give --intervention KNOB=VALUE,VALUE or --setting KNOB=VALUE,KNOB=VALUE",
         )
-    env, settings = _settings(session, env, intervention, setting)
+    env = resolve(env).name
     config = session.config(env)
+    settings = _settings(env, config, intervention, setting)
     listed = config.interventions.get(intervention or "")
     counts: Sequence[int] = ()
     if episodes is not None:
@@ -86,18 +88,17 @@ def import_demonstrations(
             "give --intervention KNOB=VALUE,VALUE, or --setting default for the unchanged "
             "environment",
         )
-    env, settings = _settings(session, env, intervention, setting)
+    env = resolve(env).name
+    settings = _settings(env, session.config(env), intervention, setting)
     form, found = recorded(recordings)
     return import_stage.request(form, found, env, settings, setting_column, cut)
 
 
 def _settings(
-    session: StageSession, ref: str, intervention: str | None, setting: Sequence[str]
-) -> tuple[str, list[Setting]]:
-    """The name of the environment, and the settings that are named."""
-    env = resolve(ref).name
-    config = session.config(env)
+    env: str, config: Config, intervention: str | None, setting: Sequence[str]
+) -> list[Setting]:
+    """The settings that are named."""
     named: Sequence[Setting] = ()
     if intervention is not None:
         named = arguments.named_settings(env, config, intervention, "id")
-    return env, arguments.with_several(env, named, setting)
+    return arguments.with_several(env, named, setting)
