@@ -122,8 +122,9 @@ def _stack(env: str, layers: Layers) -> Config:
         if tree and not values:
             # The standard profile is usually empty, and every command comes through here.
             continue
-        tree = _merge(tree, values)
         try:
+            _check_names(values, Config, ())
+            tree = _merge(tree, values)
             config = _convert(env, tree)
         except UsageError as error:
             raise UsageError(f"{source}: {error.message}", error.hint) from None
@@ -240,7 +241,6 @@ def _nest(path: Sequence[str], value: Any) -> dict[str, Any]:
 
 
 def _convert(env: str, tree: Mapping[str, Any]) -> Config:
-    _check_names(tree, Config, ())
     for knob in tree.get("interventions", {}):
         knob_of(env, knob)
     try:
