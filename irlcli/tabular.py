@@ -201,9 +201,9 @@ def hard_backup(action_values: np.ndarray) -> np.ndarray:
 
 
 def backward(
-    settings: StackedMDPs, reward: np.ndarray, horizon: int, backup: Backup, discount: float = 1.0
+    settings: StackedMDPs, reward: np.ndarray, horizon: int, backup: Backup
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finite-horizon dynamic programming: V_H = r, Q_t = gamma E[V_{t+1}], V_t = r + backup(Q_t).
+    """Finite-horizon dynamic programming: V_H = r, Q_t = E[V_{t+1}], V_t = r + backup(Q_t).
 
     A trajectory is s_0, a_0, ..., s_H: H actions, and a reward for each of its H + 1 states.
 
@@ -219,13 +219,11 @@ def backward(
     """
     e, n, a = settings.shape
     flat = columns(settings, reward)
-    check_size(horizon, discount, a * flat.size)
+    check_size(horizon, a * flat.size)
     policy = np.empty((horizon, a, *flat.shape))
     value = flat
     for t in reversed(range(horizon)):
         after = settings.spread @ value
-        if discount != 1.0:
-            after *= discount
         # All indices are in range; with "clip", take writes to ``out`` without a buffer.
         after.take(settings.afterstate, axis=0, out=policy[t], mode="clip")
         value = backup(policy[t])
@@ -233,14 +231,12 @@ def backward(
     return policy.reshape(horizon, a, e, n, -1), value.reshape(e, n, -1)
 
 
-def forward(
-    settings: StackedMDPs, policy: np.ndarray, discount: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
+def forward(settings: StackedMDPs, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State distributions under ``policy`` [H, A, E, S, R], as :func:`backward` returns it.
 
     Returns:
-        The occupancy sum_{t=0..H} gamma^t P(s_t = s) [R, E, S], and P(s_H = s) [R, E, S]. An
-        episode that has ended is in no state, so P(s_H) may sum to less than one.
+        The occupancy sum_{t=0..H} P(s_t = s) [R, E, S], and P(s_H = s) [R, E, S]. An episode
+        that has ended is in no state, so P(s_H) may sum to less than one.
     """
     horizon, a, e, n, runs = policy.shape
     state = columns(settings, np.broadcast_to(settings.start, (runs, e, n)))
@@ -251,7 +247,7 @@ def forward(
     for t in range(horizon):
         np.multiply(steps[t], state, out=flow)
         state = settings.spread_transposed @ (settings.collect @ outflow)
-        occupancy += state if discount == 1.0 else discount ** (t + 1) * state
+        occupancy += state
     return runs_first(settings, occupancy), runs_first(settings, state)
 
 
@@ -260,7 +256,7 @@ class Evaluation:
     """How a policy performs at the true task, [R, E]."""
 
     goal_probability: np.ndarray  # of having reached the goal within the horizon
-    true_return: np.ndarray  # undiscounted, over s_0 .. s_{H-1} as the environment computes it
+    true_return: np.ndarray  # over s_0 .. s_{H-1} as the environment computes it
 
 
 def evaluate(settings: StackedMDPs, policy: np.ndarray) -> Evaluation:
@@ -340,16 +336,14 @@ def runs_first(settings: StackedMDPs, array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array.reshape(e * n, -1).T).reshape(-1, e, n)
 
 
-def check_size(horizon: int, discount: float, numbers: int) -> None:
+def check_size(horizon: int, numbers: int) -> None:
     """Refuse what the solvers cannot do, or cannot hold: they keep ``numbers`` for every step.
 
     Raises:
-        ValueError: a horizon below 1, a discount outside (0, 1], or more than ``MEMORY_LIMIT``.
+        ValueError: a horizon below 1, or more than ``MEMORY_LIMIT``.
     """
     if horizon < 1:
         raise ValueError(f"the horizon must be at least 1 step, not {horizon}")
-    if not 0.0 < discount <= 1.0:
-        raise ValueError(f"the discount must lie in (0, 1], not {discount}")
     size = 8 * horizon * numbers
     if size > MEMORY_LIMIT:
         raise ValueError(

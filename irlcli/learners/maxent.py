@@ -67,7 +67,6 @@ def group_risks(
     grouping: str,
     horizon: int,
     seed: int,
-    discount: float = 1.0,
 ) -> Risks:
     """The risks of ``demos`` under ``grouping``, see :func:`irlcli.learners.grouping.group`.
 
@@ -86,7 +85,7 @@ def group_risks(
             count = sum(map(len, part.episodes.values()))
             for setting, episodes in part.episodes.items():
                 paths = [demos.states[setting][i] for i in episodes]
-                rho = mean_occupancy(settings.mdps[setting], paths, horizon, discount)
+                rho = mean_occupancy(settings.mdps[setting], paths, horizon)
                 occupancy[k, setting] = rho
                 shares[k, setting] = part.share * (len(paths) / count)
     return Risks(occupancy, shares, np.array([risk.weight for risk in groups]))
@@ -177,7 +176,6 @@ class MaxEnt:
         seeds: R, for the networks' initial weights.
         penalty: D, a key of ``irlcli.penalties.PENALTIES``.
         horizon: H [steps].
-        discount: in (0, 1].
         hidden: width of the hidden layer; 0 learns psi of r = psi^T features.
         learning_rate: of RMSProp.
         kinds: [R, E, S], the kind of each state, where the settings look different or runs have
@@ -202,7 +200,6 @@ class MaxEnt:
         *,
         penalty: str,
         horizon: int,
-        discount: float = 1.0,
         hidden: int = 32,
         learning_rate: float = 1e-3,
         kinds: np.ndarray | None = None,
@@ -233,7 +230,7 @@ class MaxEnt:
                 raise ValueError(f"{name} must be {list(shape)}, not {list(np.shape(array))}")
             if not (np.isfinite(array).all() and (np.asarray(array) >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative")
-        self._settings, self._horizon, self._discount = settings, horizon, discount
+        self._settings, self._horizon = settings, horizon
         self._kinds, self._n_kinds = kinds, rows
         self._risks = self._risks._replace(occupancy=self._visits(self._risks.occupancy))
         self._expert = _expert_occupancy(self._risks)
@@ -309,7 +306,7 @@ class MaxEnt:
         if self._kinds is not None:
             each = np.broadcast_to(phi[:, None], (len(phi), self._kinds.shape[1], phi.shape[1]))
             reward = np.take_along_axis(each, self._kinds, axis=2)
-        return solve(self._settings, reward, self._horizon, self._discount, reuse=reuse)
+        return solve(self._settings, reward, self._horizon, reuse=reuse)
 
     def _visits(self, occupancy: np.ndarray) -> np.ndarray:
         """``occupancy`` [R, ..., E, S] of states as [R, ..., E, T], of kinds."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,19 +79,14 @@ def demonstrations(
     return Demonstrations(tuple(cut_states), tuple(cut_actions))
 
 
-def mean_occupancy(
-    mdp: TabularMDP, paths: Iterable[np.ndarray], horizon: int, discount: float = 1.0
-) -> np.ndarray:
-    """rho_E [S]: discounted visits of each state, averaged over ``paths`` of state indices.
+def mean_occupancy(mdp: TabularMDP, paths: Sequence[np.ndarray], horizon: int) -> np.ndarray:
+    """rho_E [S]: visits of each state, averaged over ``paths`` of state indices.
 
     ``paths`` are those of :class:`Demonstrations`: each ends at the goal or at the horizon.
     """
     occupancy = np.zeros(mdp.n_states)
-    powers = discount ** np.arange(horizon + 1)
-    count = 0
     for path in paths:
-        count += 1
-        np.add.at(occupancy, path, powers[: len(path)])
+        np.add.at(occupancy, path, 1.0)
         if path[-1] == mdp.goal and not mdp.terminal[mdp.goal]:
-            occupancy[mdp.goal] += powers[len(path) :].sum()
-    return occupancy / count
+            occupancy[mdp.goal] += horizon + 1 - len(path)
+    return occupancy / len(paths)

@@ -1,8 +1,8 @@
 """The maximum-causal-entropy policy of a finite MDP, solved exactly (Ziebart et al. 2010).
 
 A soft backward pass gives the policy and log Z, a forward pass gives the state occupancy. Both use
-the same finite horizon and discount, in float64. A trajectory has H actions and H + 1 states, and
-each state is rewarded.
+the same finite horizon, without discount, in float64. A trajectory has H actions and H + 1 states,
+and each state is rewarded.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class Solution:
     """
 
     settings: StackedMDPs
-    log_weight: np.ndarray  # [H, E * X, R], gamma E[V_{t+1}] from each afterstate
+    log_weight: np.ndarray  # [H, E * X, R], E[V_{t+1}] from each afterstate
     log_total: np.ndarray  # [H, E * S, R], log sum_a exp of it
     log_partition: np.ndarray  # [R, E], log Z = E[V_0] over the start distribution
-    occupancy: np.ndarray  # [R, E, S], d log Z / d r(s) = sum_{t=0..H} gamma^t P(s_t = s)
+    occupancy: np.ndarray  # [R, E, S], d log Z / d r(s) = sum_{t=0..H} P(s_t = s)
 
     @property
     def policy(self) -> np.ndarray:
@@ -42,12 +42,11 @@ def solve(
     settings: StackedMDPs,
     reward: np.ndarray,
     horizon: int,
-    discount: float = 1.0,
     reuse: Solution | None = None,
 ) -> Solution:
     """Soft backward pass, then forward pass.
 
-    V_H = r, Q_t(s, a) = gamma E[V_{t+1}], V_t = r + log sum_a exp Q_t, pi_t = exp(Q_t - log sum).
+    V_H = r, Q_t(s, a) = E[V_{t+1}], V_t = r + log sum_a exp Q_t, pi_t = exp(Q_t - log sum).
     V_t = r where the episode has ended, because nothing is chosen there. An absorbing state's
     actions are choices like any other's.
 
@@ -63,7 +62,7 @@ def solve(
     e, n, a = settings.shape
     flat = columns(settings, reward)
     afterstates = len(settings.mdps[0].successor) * e
-    check_size(horizon, discount, (afterstates + e * n) * (flat.size // (e * n)))
+    check_size(horizon, (afterstates + e * n) * (flat.size // (e * n)))
     ended = np.flatnonzero(settings.terminal)
     if reuse is None:
         log_weight = np.empty((horizon, afterstates, *flat.shape[1:]))
@@ -78,7 +77,8 @@ def solve(
     each = np.empty((a, *flat.shape))
     value = flat
     for t in reversed(range(horizon)):
-        weight = np.multiply(settings.spread @ value, discount, out=log_weight[t])
+        weight = log_weight[t]
+        weight[...] = settings.spread @ value
         largest = weight.max(0)
         if (largest - weight.min(0)).max() <= SAFE_SPAN:
             scales[t] = largest
@@ -103,7 +103,7 @@ def solve(
             each *= state
             arriving = settings.collect @ each.reshape(a * e * n, *state.shape[1:])
         state = settings.spread_transposed @ arriving
-        occupancy += state if discount == 1.0 else discount ** (t + 1) * state
+        occupancy += state
     return Solution(
         settings=settings,
         log_weight=log_weight.reshape(horizon, afterstates, -1),

@@ -39,9 +39,9 @@ def maxent(settings, features, risks, penalty_weight=0.0, l2=0.0, seed=0, **chan
     )
 
 
-def risk(settings, risks, k, phi, horizon=16, discount=1.0):
+def risk(settings, risks, k, phi, horizon=16):
     """L_k: the mean negative log-likelihood of a risk's demonstrations, by its definition."""
-    partition = solve(settings, phi[None], horizon, discount).log_partition[0]
+    partition = solve(settings, phi[None], horizon).log_partition[0]
     return sum(
         risks.shares[k, e] * (partition[e] - risks.occupancy[k, e] @ phi)
         for e in range(len(partition))
@@ -199,22 +199,18 @@ def test_irmv1_full_is_differentiated_through_the_policy(grouping):
     assert np.allclose(learner.networks.psi.grad[0, :, 0], numeric, rtol=1e-4, atol=1e-4)
 
 
-def test_a_step_follows_the_gradient_of_the_discounted_risk():
-    """By finite differences in phi, the demonstrations' visits discounted alike."""
+def test_a_step_follows_the_gradient_of_the_risk():
+    """By finite differences in phi."""
     settings = mazes()
     demos = expert_demonstrations(settings, COUNTS)
-    risks = group_risks(settings, demos, "pooled", 16, seed=0, discount=0.9)
-    learner = maxent(settings, np.eye(25), risks, hidden=0, discount=0.9)
+    risks = group_risks(settings, demos, "pooled", 16, seed=0)
+    learner = maxent(settings, np.eye(25), risks, hidden=0)
     phi = np.random.default_rng(0).normal(size=25)
     with torch.no_grad():
         learner.networks.psi[0, :, 0] = torch.as_tensor(phi)
     learner.step(record=False)
     numeric = [
-        (
-            risk(settings, risks, 0, phi + d, discount=0.9)
-            - risk(settings, risks, 0, phi - d, discount=0.9)
-        )
-        / 2e-5
+        (risk(settings, risks, 0, phi + d) - risk(settings, risks, 0, phi - d)) / 2e-5
         for d in 1e-5 * np.eye(25)
     ]
     assert np.allclose(learner.networks.psi.grad[0, :, 0], numeric, atol=1e-6)

@@ -14,10 +14,10 @@ def test_expert_occupancy_by_hand(goal):
     settings = stack([gridworld(3, goal=goal)])
     demos = demonstrations(settings, [[PATH, PATH]], [[MOVES, MOVES]], horizon=6)
     expected = np.zeros(9)
-    expected[PATH] = 0.5 ** np.arange(5)
+    expected[PATH] = 1.0
     if goal == "absorbing":
-        expected[8] += 0.5**5 + 0.5**6
-    assert np.allclose(mean_occupancy(settings.mdps[0], demos.states[0], 6, discount=0.5), expected)
+        expected[8] += 2.0
+    assert np.allclose(mean_occupancy(settings.mdps[0], demos.states[0], 6), expected)
 
 
 def test_a_recording_that_stays_in_the_goal_counts_like_one_that_ended():

@@ -10,13 +10,13 @@ from irlcli.learners.soft_values import SAFE_SPAN, solve
 from irlcli.tabular import dense_transitions, stack
 
 
-def dense_log_partition(mdp, reward: torch.Tensor, horizon: int, discount: float) -> torch.Tensor:
+def dense_log_partition(mdp, reward: torch.Tensor, horizon: int) -> torch.Tensor:
     """E[V_0] by a dense soft backward pass that autograd can follow. ``reward`` [S]."""
     dense = torch.as_tensor(dense_transitions(mdp))
     ended = torch.as_tensor(mdp.terminal)
     value = reward
     for _ in range(horizon):
-        soft = torch.logsumexp(discount * dense @ value, 0)
+        soft = torch.logsumexp(dense @ value, 0)
         value = reward + torch.where(ended, torch.zeros_like(soft), soft)
     return torch.as_tensor(mdp.start) @ value
 
@@ -50,14 +50,13 @@ def test_without_chance_the_occupancy_is_the_gibbs_distributions(goal):
     assert np.allclose(solution.occupancy[0, 0], visits / total, atol=1e-10)
 
 
-@pytest.mark.parametrize("discount", [1.0, 0.8])
 @pytest.mark.parametrize("goal", GOALS)
-def test_occupancy_equals_the_enumeration_of_all_trajectories(goal, discount):
+def test_occupancy_equals_the_enumeration_of_all_trajectories(goal):
     mdp = gridworld(2, goal=goal)
     reward = np.random.default_rng(1).normal(size=4)
     horizon = 4
     dense = dense_transitions(mdp)
-    solution = solve(stack([mdp]), reward[None], horizon, discount)
+    solution = solve(stack([mdp]), reward[None], horizon)
     policy = solution.policy[:, :, 0, :, 0]
     expected, mass = np.zeros(4), 0.0
     for states, actions in paths(mdp, dense, horizon):
@@ -65,21 +64,20 @@ def test_occupancy_equals_the_enumeration_of_all_trajectories(goal, discount):
         for t, a in enumerate(actions):
             chance *= policy[t, a, states[t]] * dense[a, states[t], states[t + 1]]
         mass += chance
-        np.add.at(expected, states, chance * discount ** np.arange(len(states)))
+        np.add.at(expected, states, chance)
     assert mass == pytest.approx(1.0, abs=1e-12)
     assert np.allclose(solution.occupancy[0, 0], expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("discount", [1.0, 0.9])
 @pytest.mark.parametrize("goal", GOALS)
-def test_solver_equals_a_dense_one_and_its_gradient_by_autograd(goal, discount):
+def test_solver_equals_a_dense_one_and_its_gradient_by_autograd(goal):
     settings = stack([gridworld(6, path_group=g, goal=goal) for g in PATH_GROUPS])
     reward = torch.randn(2, 36, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    solution = solve(settings, reward.numpy(), 20, discount)
+    solution = solve(settings, reward.numpy(), 20)
     for e, mdp in enumerate(settings.mdps):
         for r in range(2):
             leaf = reward[r].clone().requires_grad_(True)
-            partition = dense_log_partition(mdp, leaf, 20, discount)
+            partition = dense_log_partition(mdp, leaf, 20)
             partition.backward()
             assert solution.log_partition[r, e] == pytest.approx(partition.item(), abs=1e-11)
             assert np.allclose(solution.occupancy[r, e], leaf.grad.numpy(), atol=1e-11)
@@ -94,7 +92,7 @@ def test_values_that_span_too_much_for_one_scale_are_solved_too(goal):
     assert (span > SAFE_SPAN).any() and (span < SAFE_SPAN).any()  # either way in one solution
     for r in range(2):
         leaf = torch.tensor(reward[r], requires_grad=True)
-        partition = dense_log_partition(settings.mdps[1], leaf, 20, 1.0)
+        partition = dense_log_partition(settings.mdps[1], leaf, 20)
         partition.backward()
         assert solution.log_partition[r, 1] == pytest.approx(partition.item(), rel=1e-13)
         assert np.allclose(solution.occupancy[r, 1], leaf.grad.numpy(), atol=1e-9)

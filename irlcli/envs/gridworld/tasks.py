@@ -38,7 +38,7 @@ def mdp(text: str, grid: GridworldConfig) -> tabular.TabularMDP:
     """
     with usable_input():
         # These checks come first, because building a grid of that size may take minutes.
-        tabular.check_size(grid.horizon, 1.0, _ACTIONS * grid.size**2)
+        tabular.check_size(grid.horizon, _ACTIONS * grid.size**2)
         if grid.horizon < 2 * (grid.size - 1):
             raise ValueError(
                 f"the goal is {2 * (grid.size - 1)} steps away, the horizon only {grid.horizon}"
