@@ -97,12 +97,8 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_quoted, value))}]"
+        return f"[{', '.join(map(json.dumps, value))}]"
     return "none" if value is None else str(value)
-
-
-def _quoted(value: Any) -> str:
-    return json.dumps(value)
 
 
 def listed(given: Any) -> list[Any]:

@@ -192,7 +192,7 @@ class AIRL:
         )
         return reward.numpy().reshape(rollout.terminated.shape)
 
-    def challenger_rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
+    def challenger_rewards(self, rollout: Rollout) -> np.ndarray:
         """The rewards [T, N] of a challenger: the current g, bounded as in ``ChallengerConfig``."""
         data = self.view.of(rollout.transitions(slice(None), self._horizon))
         reward = bounded_pay(

@@ -123,7 +123,7 @@ def _ranks(values: np.ndarray, present: np.ndarray) -> np.ndarray:
     return rankdata(np.where(present, values, np.inf), axis=-1)
 
 
-def agreement(members: Sequence[Member], lower: bool = False, seed: int = 0) -> Agreement:
+def agreement(members: Sequence[Member], lower: bool = False) -> Agreement:
     """Correlations of the mean learned with the mean true return over the bank.
 
     The 95 % percentile intervals resample policies, with all their settings, and episodes within
@@ -133,7 +133,6 @@ def agreement(members: Sequence[Member], lower: bool = False, seed: int = 0) -> 
     Args:
         members: of one setting or of several; each has the same number of episodes.
         lower: whether to leave the better half out.
-        seed: of the resampling.
     """
     policies = list(dict.fromkeys(m.policy for m in members))
     settings = list(dict.fromkeys(m.setting for m in members))
@@ -144,7 +143,7 @@ def agreement(members: Sequence[Member], lower: bool = False, seed: int = 0) -> 
     for m in members:
         at = policies.index(m.policy), settings.index(m.setting)
         present[at], true[at], learned[at] = True, m.true, m.learned
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     drawn = rng.integers(shape[0], size=(_RESAMPLES, shape[0]))
     means = np.empty((2, _RESAMPLES, *shape))
     part = max(1, RESAMPLED_AT_ONCE // (present.size * episodes))

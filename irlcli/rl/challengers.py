@@ -22,7 +22,7 @@ from irlcli.trajectories import Rollout
 class Challenged(Protocol):
     """The learner whose reward is challenged."""
 
-    def challenger_rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
+    def challenger_rewards(self, rollout: Rollout) -> np.ndarray:
         """The rewards [T, N] of a challenger for its own ``rollout``."""
 
 
@@ -60,7 +60,7 @@ class Challengers:
 
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The rewards [T, N] of a rollout, by the reward as it is now."""
-        return self._learner.challenger_rewards(rollout, policy)
+        return self._learner.challenger_rewards(rollout)
 
     def train_round(self, index: int) -> list[Rollout]:
         """The rollouts of the challenger of round ``index``, updated on each of them."""

@@ -185,7 +185,7 @@ def test_a_challenger_is_paid_the_bounded_reward(demos):
     for ceiling in (0.1, 0.9):
         challenger = replace(learner.config.challenger, ceiling=ceiling)
         learner.config = replace(learner.config, challenger=challenger)
-        paid = learner.challenger_rewards(rollout, trainer.policy).ravel()
+        paid = learner.challenger_rewards(rollout).ravel()
         highest = np.quantile(learner.quantiles, ceiling)
         np.testing.assert_allclose(paid, np.minimum(g, highest), rtol=1e-5)
         assert (paid < g).any()
@@ -203,7 +203,7 @@ def test_a_challengers_absorbing_state_earns_a_series_in_its_own_discount(demos)
         absorbing, _ = learner.model.absorbing_reward(torch.as_tensor(data.next_observations))
     highest = np.quantile(learner.quantiles, challenger.ceiling)
     series = np.where(data.terminated, np.minimum(absorbing.numpy(), highest), 0.0)
-    paid = learner.challenger_rewards(rollout, trainer.policy).ravel()
+    paid = learner.challenger_rewards(rollout).ravel()
     assert data.terminated.any()
     np.testing.assert_allclose(paid, np.minimum(g, highest) + series, rtol=1e-4, atol=1e-5)
 
