@@ -84,6 +84,11 @@ def file_failure(error: OSError) -> StageFailed:
     return StageFailed(f"{error.strerror or error}{where}", RETRY)
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of any exception's message, or its class if it has none."""
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
 _KINDS = {
     "int": "a whole number",
     "float": "a number",

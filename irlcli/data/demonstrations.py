@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from irlcli.data.parquet import UNREADABLE, open_table, write_table, writer
-from irlcli.errors import IntegrityError, NewerFormat
+from irlcli.errors import IntegrityError, NewerFormat, first_line
 from irlcli.interventions import MAX_SETTING_LENGTH, Setting
 from irlcli.trajectories import Trajectory
 
@@ -181,7 +181,7 @@ def read_metadata(directory: Path) -> dict[str, Any]:
         ) from None
     except UNREADABLE as error:
         raise IntegrityError(
-            f"{path} is not a demonstrations file ({_first_line(error)})",
+            f"{path} is not a demonstrations file ({first_line(error)})",
             "`irl collect-experts` writes demonstrations",
         ) from None
     if version > SCHEMA:
@@ -203,7 +203,7 @@ def read_demonstrations(directory: Path) -> Demonstrations:
         raise IntegrityError(f"{error.filename or STEPS} is missing in {directory}") from None
     except UNREADABLE as error:
         raise IntegrityError(
-            f"the demonstrations in {directory} are damaged ({_first_line(error)})"
+            f"the demonstrations in {directory} are damaged ({first_line(error)})"
         ) from None
     return Demonstrations(tags["env"], trajectories, tags)
 
@@ -343,7 +343,3 @@ def column_array(column: pa.ChunkedArray) -> np.ndarray:
     size = column.type.list_size
     parts = [chunk.flatten().to_numpy().reshape(-1, size) for chunk in column.chunks]
     return np.concatenate(parts) if parts else np.empty((0, size), np.float32)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -23,9 +23,11 @@ from irlcli.configs.schema import (
     Widths,
 )
 from irlcli.envs.registry import environment
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import IntegrityError, UsageError, first_line
 from irlcli.interventions import parse_setting
 
+# Of a dataset: every episode is validated on its own when demonstrations are read.
+MOST_EPISODES = 100_000
 Size = Annotated[int, Meta(ge=1, le=4096)]
 Settings = Annotated[tuple[str, ...], Meta(min_length=1)]
 MethodName = Annotated[str, Meta(max_length=100)]
@@ -388,5 +390,4 @@ def parse(value: Any, form: type[Form], source: Path | str) -> Form:
 
 
 def _malformed(source: Path | str, error: Exception) -> IntegrityError:
-    reason = str(error).splitlines()[0][:300]
-    return IntegrityError(f"{source}: its description is malformed ({reason})")
+    return IntegrityError(f"{source}: its description is malformed ({first_line(error)[:300]})")

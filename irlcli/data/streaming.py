@@ -22,13 +22,11 @@ from irlcli.data.demonstrations import (
     read_episodes,
     steps_schema,
 )
+from irlcli.data.descriptions import MOST_EPISODES
 from irlcli.data.parquet import UNREADABLE, batches, write_table, writer
 from irlcli.data.steps import PIECE, Steps, mixed_rewards, pieces
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import IntegrityError, UsageError, first_line
 from irlcli.interventions import Setting
-
-# Every episode is validated on its own when demonstrations are read.
-MOST_EPISODES = 100_000
 
 
 class Written(NamedTuple):
@@ -243,7 +241,6 @@ class _readable:
         if isinstance(error, FileNotFoundError):
             raise IntegrityError(f"{self._directory} holds no demonstrations") from None
         if isinstance(error, UNREADABLE):
-            text = (str(error) or type(error).__name__).splitlines()[0]
             raise IntegrityError(
-                f"the demonstrations in {self._directory} are damaged ({text})"
+                f"the demonstrations in {self._directory} are damaged ({first_line(error)})"
             ) from None

@@ -25,7 +25,7 @@ import torch
 from msgspec import Struct
 
 from irlcli.data import descriptions
-from irlcli.errors import IntegrityError, NewerFormat, UsageError
+from irlcli.errors import IntegrityError, NewerFormat, UsageError, first_line
 from irlcli.interventions import parse_setting
 from irlcli.learners.reward_model import RewardModule, build
 
@@ -92,9 +92,9 @@ def from_bytes(data: bytes) -> Any:
     except Exception as error:
         if isinstance(error, RuntimeError) and "can't allocate memory" in str(error):
             # As torch reports it.
-            raise MemoryError(_first_line(error)) from None
+            raise MemoryError(first_line(error)[:200]) from None
         # A crafted archive makes zipfile and torch raise almost anything.
-        raise ValueError(_first_line(error)) from None
+        raise ValueError(first_line(error)[:200]) from None
 
 
 def restore(data: bytes | None, names: set[str], discard: Callable[[str], None]) -> Any:
@@ -232,8 +232,6 @@ def _check_finite(path: Path, state: dict[str, torch.Tensor]) -> None:
 
 
 def _misfit(path: Path, error: Exception) -> IntegrityError:
-    return IntegrityError(f"{path}: its tensors do not fit its description ({_first_line(error)})")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0][:200]
+    return IntegrityError(
+        f"{path}: its tensors do not fit its description ({first_line(error)[:200]})"
+    )

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from irlcli.envs.adapted import Adapted, prints_aside
 from irlcli.envs.registration import make
 from irlcli.envs.spec import EnvironmentSpec, Knob
-from irlcli.errors import IrlError
+from irlcli.errors import IrlError, first_line
 from irlcli.interventions import Setting, Value, parse_value
 
 _MOST_STEPS = 200
@@ -69,7 +69,7 @@ def _outcome(what: str, run: Callable[[], object]) -> Found:
             run()
             wrong = ""
         except (_Wrong, IrlError) as error:
-            wrong = _line(error)
+            wrong = first_line(error)
     own = [w for w in caught if issubclass(w.category, UserWarning)]
     return Found(what, wrong, tuple(dict.fromkeys(_plain(str(w.message)) for w in own)))
 
@@ -79,10 +79,6 @@ def _plain(text: str) -> str:
     return (
         text.replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ").splitlines()[0]
     )
-
-
-def _line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def _ends(knob: Knob) -> list[Value]:
@@ -123,7 +119,7 @@ def _check_env(spec: EnvironmentSpec) -> None:
             check_env(inner, skip_render_check=True)
         except (Exception, SystemExit) as error:
             # It asserts, and an environment can raise anything.
-            raise _Wrong(_plain(_line(error))) from error
+            raise _Wrong(_plain(first_line(error))) from error
 
 
 def _check_seeds(spec: EnvironmentSpec, seed: int) -> None:

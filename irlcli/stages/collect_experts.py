@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from irlcli.configs import Config, GridworldConfig
+from irlcli.data.descriptions import MOST_EPISODES
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, parse_setting
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 _SAVED = ".zip"
 # The role of an input, before the setting.
 _NORMALISER = "normaliser"
-# Every episode is validated on its own when demonstrations are read.
-_MOST_EPISODES = 100_000
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,9 +86,9 @@ def request(
             f"{len(counts)} episode counts for {len(settings)} settings",
             "give one count for all settings or one for each",
         )
-    if sum(counts) > _MOST_EPISODES:
+    if sum(counts) > MOST_EPISODES:
         raise UsageError(
-            f"{sum(counts):,} episodes are more than the {_MOST_EPISODES:,} of one dataset",
+            f"{sum(counts):,} episodes are more than the {MOST_EPISODES:,} of one dataset",
             "record fewer, or spread them over several seeds",
         )
     texts = tuple(str(s) for s in settings)

@@ -1,6 +1,6 @@
 """What fsspec and its protocols raise, as errors that name the URL and say what to do."""
 
-from irlcli.errors import IrlError, NotFound, StageFailed, UsageError
+from irlcli.errors import IrlError, NotFound, StageFailed, UsageError, first_line
 
 
 def explained(error: Exception, url: str) -> IrlError:
@@ -8,7 +8,7 @@ def explained(error: Exception, url: str) -> IrlError:
     # Protocols raise classes of their own, which must not be imported: known by their names.
     kinds = {kind.__name__ for kind in type(error).__mro__}
     protocol = url.partition("://")[0]
-    text = (str(error) or type(error).__name__).splitlines()[0]
+    text = first_line(error)
     if isinstance(error, ValueError) and text.startswith("Protocol not known"):
         return UsageError(
             f"{url}: the protocol {protocol!r} is unknown",

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from irlcli.data.steps import Irregular
-from irlcli.errors import UsageError
+from irlcli.errors import UsageError, first_line
 from irlcli.interventions import parse_setting
 from irlcli.trajectories import ActionSpace
 
@@ -158,5 +158,4 @@ def require_all(column: pa.Array, name: str, place: Place) -> None:
 
 def unreadable(source: object, error: Exception) -> str:
     """The message of a source that its format's reader refuses."""
-    text = (str(error) or type(error).__name__).splitlines()[0]
-    return f"{source} cannot be read ({text[:200]})"
+    return f"{source} cannot be read ({first_line(error)[:200]})"

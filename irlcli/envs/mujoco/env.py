@@ -23,7 +23,7 @@ from gymnasium.utils import EzPickle
 from irlcli.envs.checks import clipped, is_finite, require
 from irlcli.envs.mujoco.model import Changes, intervened
 from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
-from irlcli.errors import StageFailed
+from irlcli.errors import StageFailed, first_line
 
 _KNOBS = {knob.argument: knob for spec in MUJOCO_ROBOTS for knob in spec.knobs.values()}
 _UNSTABLE = "the simulation is unstable: a position, speed or acceleration is huge or not a number"
@@ -137,7 +137,7 @@ class Robot(MujocoEnv, EzPickle):
             # OpenGL's bindings raise anything.
             raise StageFailed(
                 f"MuJoCo cannot draw with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}: "
-                f"{str(error).splitlines()[0] if str(error) else type(error).__name__}",
+                f"{first_line(error)}",
                 "set MUJOCO_GL=egl or MUJOCO_GL=osmesa; only pictures need OpenGL",
             ) from None
 
