@@ -22,6 +22,7 @@ from irlcli.stages.base import (
     Source,
     Stage,
     environment_key,
+    frozen_reward,
     run_training,
 )
 
@@ -86,34 +87,27 @@ def run(job: Job) -> None:
 
     from irlcli.data.outputs import write_metrics, write_policy
     from irlcli.data.tensors import load_reward_file
-    from irlcli.learners.frozen import FrozenReward
     from irlcli.rl import algorithm
     from irlcli.rl.loop import LastRound, NoLearner, Training
     from irlcli.rl.policy import require_observations
     from irlcli.rl.restarts import Restarts
     from irlcli.rl.rollout import roll_out
-    from irlcli.rl.worlds import action_space, make_worlds, observation_size
+    from irlcli.rl.worlds import make_worlds
     from irlcli.seeds import derive
 
     p: Parameters = job.parameters
     env, config = p.environment.name, p.transfer.trained_by
-    where = f"{env} {p.setting}"
     settings = [parse_setting(env, p.setting)]
     model, origin = load_reward_file(job.inputs["reward"])
     student = None
     if "start" in job.inputs:
         student, config = _student(job.inputs["start"], config)
+    reward = frozen_reward(
+        p.environment, p.setting, model, origin, p.transfer.ceiling, config.gamma
+    )
     with closing(make_worlds(env, settings, config.n_envs, job.workers)) as worlds:
-        reward = FrozenReward(
-            model,
-            origin,
-            horizon=p.environment.max_episode_steps,
-            gamma=config.gamma,
-            where=where,
-            observation_size=observation_size(worlds.observation_space),
-            actions=action_space(worlds.action_space),
-            ceiling=p.transfer.ceiling,
-        )
+        if student is not None:
+            require_observations(student, worlds.observation_space, f"{env} {p.setting}")
 
         def begin(restart: int) -> Training:
             seed = derive(f"{STAGE.name} restart", p.seed, restart)[0] if restart else p.seed
@@ -123,7 +117,6 @@ def run(job: Job) -> None:
                 worlds, config, p.transfer.total_steps, seed, STAGE.name, **kept
             )
             if student is not None:
-                require_observations(student, worlds.observation_space, where)
                 trainer.policy.load_state_dict(student.state_dict())
             return Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
 
