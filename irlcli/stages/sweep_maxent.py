@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import asdict, replace
@@ -14,7 +14,13 @@ from irlcli.configs.relevance import relevant_maxent
 from irlcli.interventions import Setting, check_tabular
 from irlcli.stages import collect_experts
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
-from irlcli.stages.train_maxent import indexed, judge, read_gridworld
+from irlcli.stages.train_maxent import indexed, judge, read_gridworld, side_by_side
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from irlcli.learners.occupancy import Demonstrations
+    from irlcli.tabular import StackedMDPs
 
 # The penalties that Figure 2 compares; the paper's L2 weight of ERM and its lambdas of IRM.
 PENALTIES = ("irmv1", "closed-form")
@@ -172,40 +178,32 @@ def run(job: Job) -> None:
     write_table(pa.Table.from_pylist(rows), job.output / "quality.parquet")
 
 
-def _fit(job, settings, demos, runs, rewards, state):
+def _fit(
+    job: Job,
+    settings: StackedMDPs,
+    demos: Mapping[int, Demonstrations],
+    runs: Sequence[tuple[Variant, int]],
+    rewards: Sequence[np.ndarray],
+    state: Any,
+) -> np.ndarray:
     """The rewards [R, S] of ``runs`` (variant, seed), all of one penalty.
 
     ``rewards`` are those of earlier penalties, ``state`` is where an interrupted fit stood.
     """
-    import numpy as np
     import torch
 
     from irlcli.data import tensors
     from irlcli.envs.gridworld import tasks
-    from irlcli.learners.maxent import MaxEnt, group_risks
 
     p: Parameters = job.parameters
-    m, horizon = p.shared, p.gridworld.horizon
-    with tasks.usable_input():
-        learner = MaxEnt(
-            settings,
-            tasks.features(m.inputs, p.gridworld),
-            [group_risks(settings, demos[seed], v.grouping, horizon, seed) for v, seed in runs],
-            np.array([v.penalty_weight for v, _ in runs]),
-            np.array([v.l2 for v, _ in runs]),
-            [seed for _, seed in runs],
-            penalty=runs[0][0].penalty,
-            horizon=horizon,
-            hidden=m.hidden if m.features == "learned" else 0,
-            learning_rate=m.learning_rate,
-            penalty_warmup=m.penalty_warmup_iterations or 0,
-        )
+    each = [(replace(p.shared, **asdict(v)), demos[seed], seed) for v, seed in runs]
+    learner = side_by_side(settings, p.gridworld, each)
     if state is not None:
         with tensors.fitting(job.output.parent, Exception):
             learner.load_state_dict(state)
     # Larger fits take longer, so progress counts iterations of single rewards.
-    before = m.iterations * sum(map(len, rewards))
-    total = m.iterations * len(p.variants) * len(p.seeds)
+    before = p.shared.iterations * sum(map(len, rewards))
+    total = p.shared.iterations * len(p.variants) * len(p.seeds)
 
     def after_record() -> None:
         done = before + learner.iterations * len(runs)
@@ -216,7 +214,7 @@ def _fit(job, settings, demos, runs, rewards, state):
         )
 
     with tasks.usable_input():
-        return learner.fit(m.iterations, after_record=after_record)
+        return learner.fit(p.shared.iterations, after_record=after_record)
 
 
 STAGE = Stage("sweep-maxent", 2, run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -28,6 +28,7 @@ from irlcli.stages.base import (
 if TYPE_CHECKING:
     import numpy as np
 
+    from irlcli.learners.maxent import MaxEnt
     from irlcli.learners.occupancy import Demonstrations
     from irlcli.learners.tabular_quality import Quality
     from irlcli.tabular import StackedMDPs
@@ -86,34 +87,18 @@ def describe(maxent: MaxEntConfig) -> str:
 
 def run(job: Job) -> None:
     """Fit the reward, then judge it in every setting."""
-    import numpy as np
     import torch
 
     from irlcli.data import descriptions, tensors
     from irlcli.data.outputs import write_json, write_metrics
     from irlcli.envs.gridworld import tasks
-    from irlcli.learners.maxent import MaxEnt, group_risks
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
     m = p.maxent
     grid, episodes = read_gridworld(job.inputs["demonstrations"], p.environment.name, p.settings)
     settings = tasks.stacked(p.settings, grid)
-    demos = indexed(settings, episodes, grid)
-    with tasks.usable_input():
-        learner = MaxEnt(
-            settings,
-            tasks.features(m.inputs, grid),
-            [group_risks(settings, demos, m.grouping, grid.horizon, p.seed)],
-            np.array([m.penalty_weight]),
-            np.array([m.l2]),
-            [p.seed],
-            penalty=m.penalty,
-            horizon=grid.horizon,
-            hidden=m.hidden if m.features == "learned" else 0,
-            learning_rate=m.learning_rate,
-            penalty_warmup=m.penalty_warmup_iterations or 0,
-        )
+    learner = side_by_side(settings, grid, [(m, indexed(settings, episodes, grid), p.seed)])
     names = set(learner.state_dict())
     state = tensors.restore(job.checkpoints.load(), names, job.checkpoints.discard)
     if state is not None:
@@ -137,30 +122,37 @@ def run(job: Job) -> None:
     weights = {"reward": torch.as_tensor(reward[0]), **learner.networks.state_dict()}
     tensors.save(job.output / "reward.pt", "tabular-reward", description, weights)
     write_json(job.output / "reward.json", msgspec.to_builtins(description))
-    write_metrics(
-        job.output,
-        [
-            {
-                "iteration": record.iteration,
-                "setting": text,
-                "log_likelihood": float(record.log_likelihood[0, e]),
-                "optimised_penalty": float(record.penalty[0]),
-                "occupancy_gap": float(record.occupancy_gap[0, e]),
-            }
-            for record in learner.records
-            for e, text in enumerate(p.settings)
-        ],
-    )
+    write_metrics(job.output, _metrics(learner, p.settings))
+    write_json(job.output / "quality.json", {"settings": _quality(p, grid, reward)})
+
+
+def _metrics(learner: MaxEnt, settings: Sequence[str]) -> list[dict[str, Any]]:
+    """A row per record and setting."""
+    return [
+        {
+            "iteration": record.iteration,
+            "setting": text,
+            "log_likelihood": float(record.log_likelihood[0, e]),
+            "optimised_penalty": float(record.penalty[0]),
+            "occupancy_gap": float(record.occupancy_gap[0, e]),
+        }
+        for record in learner.records
+        for e, text in enumerate(settings)
+    ]
+
+
+def _quality(p: Parameters, grid: GridworldConfig, reward: np.ndarray) -> list[dict[str, Any]]:
+    """A row per setting, seen or unseen."""
     rows = []
     for texts, seen in ((p.settings, True), (p.unseen, False)):
         if not texts:
             continue
-        measures = vars(judge(texts, grid, reward, m.held_out))
+        measures = vars(judge(texts, grid, reward, p.maxent.held_out))
         rows += [
             {"setting": text, "seen": seen, **{k: _number(a[0, e]) for k, a in measures.items()}}
             for e, text in enumerate(texts)
         ]
-    write_json(job.output / "quality.json", {"settings": rows})
+    return rows
 
 
 def read_gridworld(
@@ -204,6 +196,40 @@ def indexed(
         states = [[state_indices(t.observations, grid.size) for t in group] for group in episodes]
         actions = [[t.actions for t in group] for group in episodes]
         return demonstrations(settings, states, actions, grid.horizon)
+
+
+def side_by_side(
+    settings: StackedMDPs,
+    grid: GridworldConfig,
+    runs: Sequence[tuple[MaxEntConfig, Demonstrations, int]],
+) -> MaxEnt:
+    """The learner of a reward for each of ``runs`` (config, demonstrations, seed).
+
+    The configs differ at most in the grouping, lambda and L2.
+
+    Raises:
+        UsageError: a grid too large to solve.
+    """
+    import numpy as np
+
+    from irlcli.envs.gridworld import tasks
+    from irlcli.learners.maxent import MaxEnt, group_risks
+
+    m = runs[0][0]
+    with tasks.usable_input():
+        return MaxEnt(
+            settings,
+            tasks.features(m.inputs, grid),
+            [group_risks(settings, d, own.grouping, grid.horizon, s) for own, d, s in runs],
+            np.array([own.penalty_weight for own, _, _ in runs]),
+            np.array([own.l2 for own, _, _ in runs]),
+            [seed for _, _, seed in runs],
+            penalty=m.penalty,
+            horizon=grid.horizon,
+            hidden=m.hidden if m.features == "learned" else 0,
+            learning_rate=m.learning_rate,
+            penalty_warmup=m.penalty_warmup_iterations or 0,
+        )
 
 
 def judge(
