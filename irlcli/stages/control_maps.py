@@ -36,6 +36,11 @@ class Variant(msgspec.Struct, frozen=True, kw_only=True):
         return text + (", sees the texture only" if self.sees == "texture" else "")
 
 
+_ERM, _BALANCED = Variant(grouping="pooled"), Variant(grouping="balanced")
+_ORACLE = Variant(grouping="pooled", sees="texture")
+_FEATURES = ("linear", "learned")
+
+
 class Case(msgspec.Struct, frozen=True, kw_only=True):
     """Variants that are fitted to the same maps.
 
@@ -87,6 +92,15 @@ def cases(maps: CuedMapsConfig) -> Iterator[Case]:
     Raises:
         UsageError: fewer than two settings where penalties compare them, or no lambda.
     """
+    _check(maps)
+    yield from _sweeps(maps)
+    yield from _without_warmup(maps)
+    yield from _numbers_of_settings(maps)
+    yield from _gaps(maps)
+    yield from _choices(maps)
+
+
+def _check(maps: CuedMapsConfig) -> None:
     if not maps.penalty_weights:
         raise UsageError(
             "control.maps.penalty_weights is empty", "for example [1.0, 100.0, 10000.0]"
@@ -102,13 +116,25 @@ def cases(maps: CuedMapsConfig) -> Iterator[Case]:
                 "penalties that compare settings need two",
                 "at least two settings, and three where one is left out",
             )
-    strongest = max(maps.penalty_weights)
-    baselines = (Variant(grouping="pooled"), Variant(grouping="balanced"))
-    oracle = Variant(grouping="pooled", sees="texture")
-    full = Variant(penalty="irmv1-full", penalty_weight=strongest)
-    vrex = Variant(penalty="vrex", penalty_weight=strongest)
+
+
+def _strongest(maps: CuedMapsConfig, penalty: str) -> Variant:
+    """``penalty`` at the largest lambda."""
+    return Variant(penalty=penalty, penalty_weight=max(maps.penalty_weights))
+
+
+def _few(maps: CuedMapsConfig) -> tuple[Variant, ...]:
+    """ERM, the oracle and the two best penalties."""
+    return (_ERM, _ORACLE, _strongest(maps, "irmv1-full"), _strongest(maps, "vrex"))
+
+
+def _sweeps(maps: CuedMapsConfig) -> Iterator[Case]:
+    """Every penalty over its lambdas, with true and with shuffled labels."""
     swept: dict[str, tuple[Variant, ...]] = {
-        "erm": (*baselines, oracle, *(Variant(grouping="pooled", l2=l2) for l2 in maps.l2s))
+        "erm": (
+            *(_ERM, _BALANCED, _ORACLE),
+            *(Variant(grouping="pooled", l2=l2) for l2 in maps.l2s),
+        )
     }
     for penalty in ("irmv1", "irmv1-full", "closed-form", "vrex", "group-dro"):
         weights = maps.penalty_weights
@@ -117,8 +143,8 @@ def cases(maps: CuedMapsConfig) -> Iterator[Case]:
         true = tuple(Variant(penalty=penalty, penalty_weight=w) for w in weights)
         shuffled = tuple(replace(v, grouping="shuffled") for v in true)
         swept[penalty] = (*true, *(shuffled if penalty == "irmv1-full" else shuffled[-1:]))
-    swept["irmv1-full"] += (replace(full, warm=False),)
-    for features in ("linear", "learned"):
+    swept["irmv1-full"] += (replace(_strongest(maps, "irmv1-full"), warm=False),)
+    for features in _FEATURES:
         for name, variants in swept.items():
             yield Case(
                 name=f"{features}.{name}",
@@ -126,25 +152,36 @@ def cases(maps: CuedMapsConfig) -> Iterator[Case]:
                 variants=variants,
                 features=features,
             )
+
+
+def _without_warmup(maps: CuedMapsConfig) -> Iterator[Case]:
+    """The smallest and the largest lambda from the start."""
     cold = tuple(
         Variant(penalty=penalty, penalty_weight=weight, warm=False)
         for penalty in ("irmv1", "vrex")
-        for weight in sorted({maps.penalty_weights[0], strongest})
+        for weight in sorted({maps.penalty_weights[0], max(maps.penalty_weights)})
     )
-    for features in ("linear", "learned"):
+    for features in _FEATURES:
         yield Case(
             name=f"cold.{features}", strengths=maps.strengths, variants=cold, features=features
         )
+
+
+def _numbers_of_settings(maps: CuedMapsConfig) -> Iterator[Case]:
+    """More settings, with one colour and with two."""
     low, high = maps.spread
-    few = (baselines[0], oracle, full, vrex)
     for colours in (1, 2):
         for count in maps.settings:
             yield Case(
                 name=f"settings.{count}.colours.{colours}",
                 strengths=_spaced(low, high, count),
-                variants=few,
+                variants=_few(maps),
                 colours=colours,
             )
+
+
+def _gaps(maps: CuedMapsConfig) -> Iterator[Case]:
+    """Two settings whose strengths lie closer together or further apart."""
     middle = sum(maps.strengths) / len(maps.strengths)
     for gap in maps.gaps:
         ends = (round(middle + gap / 2, 9), round(middle - gap / 2, 9))
@@ -154,14 +191,18 @@ def cases(maps: CuedMapsConfig) -> Iterator[Case]:
                 f"{ends[0]:g}",
                 f"a gap of at most {2 * min(middle, 1 - middle):g}",
             )
-        yield Case(name=f"gap.{gap:g}", strengths=ends, variants=few)
+        yield Case(name=f"gap.{gap:g}", strengths=ends, variants=_few(maps))
+
+
+def _choices(maps: CuedMapsConfig) -> Iterator[Case]:
+    """lambda chosen by leaving each setting out in turn."""
     weights = tuple(sorted(maps.penalty_weights))
     offered = tuple(Variant(penalty="irmv1-full", penalty_weight=w) for w in weights)
     for number, strengths in enumerate(maps.choices):
         yield Case(
             name=f"choice.{number + 1}",
             strengths=strengths,
-            variants=(baselines[1], *offered),
+            variants=(_BALANCED, *offered),
             leave_out=True,
         )
 
