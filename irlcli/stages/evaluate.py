@@ -25,6 +25,7 @@ from irlcli.stages.base import (
 
 if TYPE_CHECKING:
     from irlcli.rl.policy import Policy
+    from irlcli.trajectories import Trajectory
 
 Agent = Literal["policy", "random", "idle"]
 
@@ -69,16 +70,13 @@ def request(
             f"agent {agent!r} {'needs a' if policy is None else 'takes no'} policy",
             "give a policy, or name the random or the idle agent",
         )
-    if agent != "policy":
-        # The random and the idle agent act alike either way.
-        evaluation = msgspec.structs.replace(evaluation, deterministic=False)
     texts = tuple(str(s) for s in settings)
     parameters = Parameters(
         environment=environment_key(env, settings),
         settings=texts,
         agent=agent,
         seed=seed,
-        evaluation=evaluation,
+        evaluation=relevant_evaluation(evaluation, agent),
         ceiling=None if reward is None else ceiling,
     )
     inputs = {
@@ -92,20 +90,48 @@ def request(
     return Request(STAGE, parameters, inputs, label)
 
 
+def relevant_evaluation(evaluation: EvaluationConfig, agent: Agent) -> EvaluationConfig:
+    """``evaluation`` of ``agent``: the random and the idle one act alike, deterministic or not."""
+    if agent == "policy":
+        return evaluation
+    return msgspec.structs.replace(evaluation, deterministic=False)
+
+
+def act(job: Job, setting: str, policy: Policy | str, noise: float = 0.0) -> list[Trajectory]:
+    """The episodes of ``policy``; episode k starts from the same state for every agent and method.
+
+    The stage's parameters hold the environment, the seed and the evaluation.
+    """
+    from irlcli.rl.rollout import roll_out
+
+    p = job.parameters
+    env = p.environment.name
+    found = roll_out(
+        env,
+        parse_setting(env, setting),
+        policy,
+        p.evaluation.episodes,
+        p.seed,
+        STAGE.name,
+        p.evaluation.deterministic,
+        noise,
+    )
+    job.warn_of_errors(setting, found)
+    return found
+
+
 def run(job: Job) -> None:
-    """Roll out; episode k starts from the same state for every agent and every method."""
+    """Roll out, and score by the reward if there is one."""
     import numpy as np
     import pyarrow as pa
 
     from irlcli.data.outputs import write_json
     from irlcli.data.parquet import write_table
     from irlcli.data.tensors import load_policy_file, load_reward_file
-    from irlcli.rl.rollout import roll_out
 
     p: Parameters = job.parameters
-    env = p.environment.name
     policy: Policy | str = p.agent
-    subject: dict[str, Any] = {"agent": p.agent, "env": env}
+    subject: dict[str, Any] = {"agent": p.agent, "env": p.environment.name}
     if "policy" in job.inputs:
         policy, origin = load_policy_file(job.inputs["policy"])
         subject = msgspec.to_builtins(origin)
@@ -118,23 +144,10 @@ def run(job: Job) -> None:
         }
     rows, summary = [], []
     for index, text in enumerate(p.settings):
-        setting = parse_setting(env, text)
-        learned_returns = None
         if "reward" in job.inputs:
             frozen = frozen_reward(p.environment, text, model, learned, p.ceiling)
-        trajectories = roll_out(
-            env,
-            setting,
-            policy,
-            p.evaluation.episodes,
-            p.seed,
-            STAGE.name,
-            p.evaluation.deterministic,
-        )
-        job.warn_of_errors(text, trajectories)
-        if "reward" in job.inputs:
-            learned_returns = [frozen.of_episode(t) for t in trajectories]
-        rows += [
+        trajectories = act(job, text, policy)
+        here: list[dict[str, Any]] = [
             {
                 "setting": text,
                 "episode": k,
@@ -143,14 +156,16 @@ def run(job: Job) -> None:
                 "progress": t.progress,
                 "length": len(t),
                 "terminated": t.terminated,
-                **({} if learned_returns is None else {"learned_return": learned_returns[k]}),
             }
             for k, t in enumerate(trajectories)
         ]
         means = summary_of(text, trajectories)
         means["terminated"] = float(np.mean([t.terminated for t in trajectories]))
-        if learned_returns is not None:
-            means["mean_learned_return"] = float(np.mean(learned_returns))
+        if "reward" in job.inputs:
+            for row, trajectory in zip(here, trajectories, strict=True):
+                row["learned_return"] = frozen.of_episode(trajectory)
+            means["mean_learned_return"] = float(np.mean([row["learned_return"] for row in here]))
+        rows += here
         summary.append(means)
         facts = {text: shown(means["mean_return"], means["mean_progress"])}
         job.console.progress(index + 1, len(p.settings), "settings", facts)

@@ -65,16 +65,13 @@ def request(
         raise UsageError(
             f"agent {agent!r} does not fit its policy or noise", "noise needs a policy"
         )
-    if agent != "policy":
-        # The random and the idle agent act alike either way.
-        evaluation = msgspec.structs.replace(evaluation, deterministic=False)
     parameters = Parameters(
         environment=environment_key(env, [setting]),
         setting=str(setting),
         agent=agent,
         noise=noise,
         seed=seed,
-        evaluation=evaluation,
+        evaluation=evaluate.relevant_evaluation(evaluation, agent),
     )
     who = policy_label or (f"{agent}, noise {noise}" if noise else agent)
     label = f"record {who} in {env} {setting} seed {seed}"
@@ -87,28 +84,17 @@ def run(job: Job) -> None:
     from irlcli.data.demonstrations import write_demonstrations
     from irlcli.data.outputs import write_json
     from irlcli.data.tensors import load_policy_file
-    from irlcli.rl.rollout import roll_out
 
     p: Parameters = job.parameters
-    env, setting = p.environment.name, parse_setting(p.environment.name, p.setting)
+    env = p.environment.name
     policy: Policy | str = p.agent
     if "policy" in job.inputs:
         policy, _ = load_policy_file(job.inputs["policy"])
-    trajectories = roll_out(
-        env,
-        setting,
-        policy,
-        p.evaluation.episodes,
-        p.seed,
-        evaluate.STAGE.name,
-        p.evaluation.deterministic,
-        p.noise,
-    )
-    job.warn_of_errors(p.setting, trajectories)
+    trajectories = evaluate.act(job, p.setting, policy, p.noise)
     means = summary_of(p.setting, trajectories)
     facts = {p.setting: shown(means["mean_return"], means["mean_progress"])}
     job.console.progress(1, 1, "settings", facts)
-    write_demonstrations(job.output, env, [(setting, trajectories)], {})
+    write_demonstrations(job.output, env, [(parse_setting(env, p.setting), trajectories)], {})
     write_json(job.output / "summary.json", means)
 
 
