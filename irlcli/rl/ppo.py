@@ -133,14 +133,7 @@ class PPOTrainer:
         Raises:
             StageFailed: the policy's parameters stopped being finite, or a worker process died.
         """
-        generator_seed, *world_seeds = derive(
-            self._purpose, self._seed, index, 1 + self._venv.num_envs
-        )
-        torch.manual_seed(generator_seed)
-        # SB3 shuffles its minibatches with numpy's global generator.
-        np.random.seed(generator_seed % 2**32)
-        self._venv.seeds = world_seeds
-        self.model._last_obs = self._venv.reset()
+        self.model._last_obs = self._venv.begin_round(self._purpose, self._seed, index)
         self.model._last_episode_starts = np.ones(self._venv.num_envs, dtype=bool)
         self._deviation.begin()
         rollouts = []

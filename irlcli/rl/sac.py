@@ -131,14 +131,7 @@ class SACTrainer:
         Raises:
             StageFailed: the networks' parameters stopped being finite, or a worker process died.
         """
-        generator_seed, *world_seeds = derive(
-            self._purpose, self._seed, index, 1 + self._venv.num_envs
-        )
-        torch.manual_seed(generator_seed)
-        # SB3 samples its minibatches with numpy's global generator.
-        np.random.seed(generator_seed % 2**32)
-        self._venv.seeds = world_seeds
-        self._observations = self._venv.reset()
+        self._observations = self._venv.begin_round(self._purpose, self._seed, index)
         self._deviation.begin()
         rollouts = []
         for first in range(0, self.sac.n_steps, self.sac.train_freq):

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from irlcli.envs.registration import factory
@@ -15,6 +16,7 @@ from irlcli.envs.registry import environment
 from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.envs.workers import WorkerWorlds
 from irlcli.interventions import Setting
+from irlcli.seeds import derive
 from irlcli.trajectories import ActionSpace, Rollout, world_settings
 
 Worlds = VectorWorlds | WorkerWorlds
@@ -56,7 +58,7 @@ class RecordingVecEnv(VecEnv):
     def __init__(self, worlds: Worlds):
         self.worlds = worlds
         super().__init__(len(worlds), worlds.observation_space, worlds.action_space)
-        self.seeds: Sequence[int] = range(len(worlds))
+        self._world_seeds: Sequence[int] = range(len(worlds))
         self.rewards: list[np.ndarray] = []
         self.ended: list[tuple[int, Ended]] = []
         self._actions = np.empty(0)
@@ -66,9 +68,19 @@ class RecordingVecEnv(VecEnv):
         """Forget what was recorded."""
         self.rewards, self.ended = [], []
 
+    def begin_round(self, purpose: str, seed: int, index: int) -> np.ndarray:
+        """Seed every generator from (purpose, seed, round), and start fresh episodes.
+
+        Returns their first observations [N, D].
+        """
+        generator_seed, *self._world_seeds = derive(purpose, seed, index, 1 + self.num_envs)
+        torch.manual_seed(generator_seed)
+        # SB3 draws its minibatches with numpy's global generator.
+        np.random.seed(generator_seed)
+        return self.reset()
+
     def reset(self) -> np.ndarray:
-        """Start fresh episodes from ``seeds``; observations [N, D]."""
-        return self.worlds.reset(self.seeds)
+        return self.worlds.reset(self._world_seeds)
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
