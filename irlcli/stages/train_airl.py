@@ -80,24 +80,8 @@ def request(
             f"{airl.ppo.n_envs} worlds cannot be shared equally by {trained} settings",
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
-    rounds = airl.ppo.rounds(airl.total_steps)
-    if (airl.averaged_rounds or 1) > rounds:
-        raise UsageError(
-            f"airl.averaged_rounds = {airl.averaged_rounds}, but training has {rounds} rounds",
-            f"--set airl.averaged_rounds={rounds} or less",
-        )
     relevant = relevant_airl(airl, environment(env).discrete_actions)
-    # Rounds that the plateau can be found in, before the last.
-    compared = rounds - 1 - relevant.penalty_warmup_rounds - relevant.penalty_ramp_rounds
-    if airl.plateau_rounds and 2 * airl.plateau_rounds > compared:
-        largest = compared // 2
-        raise UsageError(
-            f"airl.plateau_rounds = {airl.plateau_rounds} needs {2 * airl.plateau_rounds} rounds "
-            f"before the last, after lambda has its full value: training has {max(compared, 0)}",
-            f"--set airl.plateau_rounds={largest} or less"
-            if largest > 0
-            else "omit airl.plateau_rounds",
-        )
+    _check_rounds(relevant)
     if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
         raise UsageError(
             f"airl.batch_size = {airl.batch_size} cannot hold an even number of samples of each of "
@@ -140,6 +124,26 @@ def _check_selection(airl: AIRLConfig, settings: Sequence[str]) -> None:
     if airl.select in settings and len(settings) == 1:
         raise UsageError(
             f"without {airl.select} no setting is left to train on", "select by episodes"
+        )
+
+
+def _check_rounds(airl: AIRLConfig) -> None:
+    rounds = airl.ppo.rounds(airl.total_steps)
+    if (airl.averaged_rounds or 1) > rounds:
+        raise UsageError(
+            f"airl.averaged_rounds = {airl.averaged_rounds}, but training has {rounds} rounds",
+            f"--set airl.averaged_rounds={rounds} or less",
+        )
+    # Rounds that the plateau can be found in, before the last.
+    compared = rounds - 1 - airl.penalty_warmup_rounds - airl.penalty_ramp_rounds
+    if airl.plateau_rounds and 2 * airl.plateau_rounds > compared:
+        largest = compared // 2
+        raise UsageError(
+            f"airl.plateau_rounds = {airl.plateau_rounds} needs {2 * airl.plateau_rounds} rounds "
+            f"before the last, after lambda has its full value: training has {max(compared, 0)}",
+            f"--set airl.plateau_rounds={largest} or less"
+            if largest > 0
+            else "omit airl.plateau_rounds",
         )
 
 
