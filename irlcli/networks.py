@@ -13,7 +13,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 CLIP = 10.0
 
 
-def mlp(inputs: int, hidden: Sequence[int], activation: str, dropout: float = 0.0) -> nn.Sequential:
+def mlp(inputs: int, hidden: Sequence[int], activation: str, dropout: float) -> nn.Sequential:
     """A perceptron with ``hidden`` layers and one output; [B, inputs] to [B, 1].
 
     In training each hidden unit is zero with probability ``dropout``. The weights have the same

@@ -36,7 +36,7 @@ _SECTIONS = {
 class Session(base.Session):
     """The store that a command reads, and how it prints."""
 
-    def __init__(self, store: Path, as_json: bool = False):
+    def __init__(self, store: Path, as_json: bool):
         super().__init__(store, out.TerminalConsole())
         self.as_json = as_json
 
@@ -76,7 +76,7 @@ class StageSession(base.StageSession):
     def __init__(
         self,
         store: Path,
-        as_json: bool = False,
+        as_json: bool,
         *,
         profile: str,
         file: Path | None,
@@ -119,7 +119,7 @@ class StageSession(base.StageSession):
     def deliver(
         self,
         requests: Sequence["Request"],
-        name: str | None = None,
+        name: str | None,
         details: Callable[[Artefact], Mapping[str, Any]] | None = None,
     ) -> list[Artefact]:
         """Run ``requests`` and print a line for each artefact; with ``--dry-run`` print the plan.

@@ -186,7 +186,7 @@ def _replay(airl: AIRLConfig) -> AIRLConfig:
 
 
 def relevant_transfer(
-    transfer: TransferConfig, discrete_actions: bool, from_student: bool = False
+    transfer: TransferConfig, discrete_actions: bool, from_student: bool
 ) -> TransferConfig:
     """``transfer`` without what its algorithm and its start leave unused.
 

@@ -20,6 +20,8 @@ from irlcli.errors import IrlError, first_line
 from irlcli.interventions import Setting, Value, parse_value
 
 _MOST_STEPS = 200
+# Of every episode.
+_SEED = 0
 
 
 class Found(NamedTuple):
@@ -34,32 +36,27 @@ class _Wrong(Exception):
     """A check failed."""
 
 
-def check(
-    spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]], seed: int = 0
-) -> Iterator[Found]:
+def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Iterator[Found]:
     """Every check of ``spec``, in order. If the environment cannot be made, the others are skipped.
 
     Args:
         spec: a known environment.
         listed: settings of each knob, by the knob's name, that its settings file lists.
-        seed: of the episodes.
     """
-    made = _outcome("it can be made", partial(_make, spec, Setting(), seed))
+    made = _outcome("it can be made", partial(_make, spec, Setting()))
     yield made
     if made.wrong:
         return
     yield _outcome("gymnasium's check_env", partial(_check_env, spec))
-    yield _outcome("equal seeds give equal episodes", partial(_check_seeds, spec, seed))
+    yield _outcome("equal seeds give equal episodes", partial(_check_seeds, spec))
     for name, knob in spec.knobs.items():
         ends = [Setting(((name, value),)) for value in _ends(knob)]
-        yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends, seed))
+        yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))
         yield _outcome(
             f"{name}: values out of bounds are refused", partial(_check_beyond, spec, name)
         )
         settings = [Setting(), *listed.get(name, ()), *ends]
-        yield _outcome(
-            f"{name}: it changes episodes", partial(_check_moves, spec, name, settings, seed)
-        )
+        yield _outcome(f"{name}: it changes episodes", partial(_check_moves, spec, name, settings))
 
 
 def _outcome(what: str, run: Callable[[], object]) -> Found:
@@ -92,12 +89,12 @@ def _ends(knob: Knob) -> list[Value]:
             return [Value(form, (x,)) for x in (knob.low, knob.high)]
 
 
-def _make(spec: EnvironmentSpec, setting: Setting, seed: int) -> list[np.ndarray]:
+def _make(spec: EnvironmentSpec, setting: Setting) -> list[np.ndarray]:
     """An episode of random actions: observations [T + 1, D] and rewards [T]."""
     with closing(make(spec.name, setting)) as world:
-        actions = np.random.default_rng(seed)
+        actions = np.random.default_rng(_SEED)
         world.action_space.seed(int(actions.integers(2**31)))
-        observation, _ = world.reset(seed=seed)
+        observation, _ = world.reset(seed=_SEED)
         observations, rewards = [observation], []
         for _ in range(min(spec.max_episode_steps, _MOST_STEPS)):
             observation, reward, terminated, truncated, _ = world.step(world.action_space.sample())
@@ -122,14 +119,14 @@ def _check_env(spec: EnvironmentSpec) -> None:
             raise _Wrong(_plain(first_line(error))) from error
 
 
-def _check_seeds(spec: EnvironmentSpec, seed: int) -> None:
-    if not _equal(*(_make(spec, Setting(), seed) for _ in range(2))):
+def _check_seeds(spec: EnvironmentSpec) -> None:
+    if not _equal(*(_make(spec, Setting()) for _ in range(2))):
         raise _Wrong("two episodes of the same seed and the same actions differ")
 
 
-def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting], seed: int) -> None:
+def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting]) -> None:
     for setting in ends:
-        _make(spec, setting, seed)
+        _make(spec, setting)
 
 
 def _check_beyond(spec: EnvironmentSpec, name: str) -> None:
@@ -146,8 +143,8 @@ def _check_beyond(spec: EnvironmentSpec, name: str) -> None:
         raise _Wrong(f"{name}={text} was accepted")
 
 
-def _check_moves(spec: EnvironmentSpec, name: str, settings: Sequence[Setting], seed: int) -> None:
-    episodes = [_make(spec, setting, seed) for setting in settings]
+def _check_moves(spec: EnvironmentSpec, name: str, settings: Sequence[Setting]) -> None:
+    episodes = [_make(spec, setting) for setting in settings]
     sizes = [observations.shape[1] for observations, _ in episodes]
     if len(set(sizes)) > 1 and not spec.knobs[name].observed:
         raise _Wrong(

@@ -54,7 +54,7 @@ class NotebookConsole(Silent):
         quiet: show warnings only.
     """
 
-    def __init__(self, quiet: bool = False):
+    def __init__(self, quiet: bool):
         self._quiet = quiet
         self._label = ""
         self._pace, self._updated = Pace(), 0.0

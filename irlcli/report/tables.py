@@ -45,18 +45,17 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str
     )
 
 
-def latex_table(columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> str:
+def latex_table(columns: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> str:
     """A LaTeX table for booktabs. One that may not fit a page also needs longtable."""
     body = [columns, *rows]
     lines = [" & ".join(latex_text(cell) for cell in line) + r" \\" for line in body]
     rules = [r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
-    captions = [rf"\caption{{{latex_text(caption)}}}"] if caption else []
+    title = rf"\caption{{{latex_text(caption)}}}"
     form = "l" * len(columns)
     if len(rows) > _PAGE_ROWS:
-        captions = [line + r" \\" for line in captions]
-        begin = [rf"\begin{{longtable}}{{{form}}}", *captions]
+        begin = [rf"\begin{{longtable}}{{{form}}}", title + r" \\"]
         return "\n".join([*begin, *rules, r"\end{longtable}", ""])
-    begin = [r"\begin{table}", r"\centering", *captions, rf"\begin{{tabular}}{{{form}}}"]
+    begin = [r"\begin{table}", r"\centering", title, rf"\begin{{tabular}}{{{form}}}"]
     return "\n".join([*begin, *rules, r"\end{tabular}", r"\end{table}", ""])
 
 

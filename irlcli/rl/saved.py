@@ -52,7 +52,7 @@ class SavedPolicy(Policy):
         normaliser: the statistics that its observations are normalised by; None: as they are.
     """
 
-    def __init__(self, model: BaseAlgorithm, normaliser: VecNormalize | None = None):
+    def __init__(self, model: BaseAlgorithm, normaliser: VecNormalize | None):
         self._model = model
         self._normaliser = normaliser
         space = model.observation_space

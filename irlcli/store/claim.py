@@ -51,9 +51,9 @@ def claimed(
     path: Path,
     locks_work: bool,
     *,
-    wait: bool = False,
-    on_wait: Callable[[str], None] | None = None,
-    what: str = "the same artefact",
+    wait: bool,
+    on_wait: Callable[[str], None] | None,
+    what: str,
 ) -> Iterator[None]:
     """Hold the claim ``path``, to be entered under the lock of this machine, if there is one.
 
@@ -82,9 +82,9 @@ def reading(
     gc: Path,
     locks_work: bool,
     *,
-    wait: bool = False,
-    on_wait: Callable[[str], None] | None = None,
-    what: str = "the store",
+    wait: bool,
+    on_wait: Callable[[str], None] | None,
+    what: str,
 ) -> Iterator[None]:
     """Keep the holder of the claim ``gc`` from starting, by a file of one's own in ``directory``.
 

@@ -75,9 +75,7 @@ def _file_problems(artefact: Artefact, quick: bool) -> list[str]:
     return found
 
 
-def verify(
-    layout: Layout, ids: Iterable[str], quick: bool = False
-) -> tuple[dict[str, Damage], Index]:
+def verify(layout: Layout, ids: Iterable[str], quick: bool) -> tuple[dict[str, Damage], Index]:
     """Check artefacts and move the damaged ones to quarantine.
 
     Returns the damaged ones, and what the sound ones were made from. Artefacts of a newer schema

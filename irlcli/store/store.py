@@ -281,9 +281,7 @@ class Store:
         """The damaged of the artefacts ``ids``: see :func:`irlcli.store.integrity.verify`."""
         return self.verify_all(ids, quick)[0]
 
-    def verify_all(
-        self, ids: Iterable[str], quick: bool = False
-    ) -> tuple[dict[str, Damage], Index]:
+    def verify_all(self, ids: Iterable[str], quick: bool) -> tuple[dict[str, Damage], Index]:
         """As :meth:`verify`, and the index of the sound ones, whose manifests it has read."""
         from irlcli.store.integrity import verify
 
