@@ -26,15 +26,19 @@ _BUDGETS = (
 def describe(record: KeyRecord) -> str:
     """Environment, agent, settings, method, retraining and seed of an artefact, where it has them."""
     parameters = record.parameters
-    environment = parameters.get("environment")
-    env = environment.get("name") if isinstance(environment, dict) else parameters.get("env")
     settings = parameters.get("settings")
     parts = [parameters.get(name) for name in ("kind", "problem", "part")]
-    parts += [env, parameters.get("agent")]
+    parts += [environment_of(parameters), parameters.get("agent")]
     parts += settings if isinstance(settings, list | tuple) else [parameters.get("setting")]
     noise = parameters.get("noise")
     parts += [f"noise {noise}"] if noise else []
     return _joined([*parts, *_made(record)])
+
+
+def environment_of(parameters: Mapping[str, Any]) -> Any:
+    """The environment's name; version 0.1 called it ``env``."""
+    environment = parameters.get("environment")
+    return environment.get("name") if isinstance(environment, dict) else parameters.get("env")
 
 
 def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:

@@ -67,9 +67,9 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     """``reward.json``, and the description inside ``reward.pt``.
 
     ``scale`` is the standard deviation of g on the training data. ``quantiles`` are the 0, 1, ...
-    100 % quantiles of g on the demonstrations; None in files of version 0.1. ``selected`` is None
-    if the last round is deployed. ``stopped_after`` are the rounds before ``airl.plateau_rounds``
-    ended the training; None if the budget was used.
+    100 % quantiles of g on the demonstrations. ``selected`` is None if the last round is deployed.
+    ``stopped_after`` are the rounds before ``airl.plateau_rounds`` ended the training; None if the
+    budget was used.
     """
 
     env: str
@@ -79,7 +79,7 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     airl: AIRLConfig
     network: RewardNetwork
     scale: Positive
-    quantiles: Quantiles | None = None
+    quantiles: Quantiles
     selected: Selected | None = None
     stopped_after: Annotated[int, Meta(ge=1)] | None = None
 

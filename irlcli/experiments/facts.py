@@ -81,7 +81,7 @@ def _subject(record: KeyRecord) -> _Subject:
     places = parameters.get("settings", parameters.get("setting"))
     return (
         record.stage,
-        _env(parameters),
+        labels.environment_of(parameters),
         tuple(places) if isinstance(places, list | tuple) else places,
         _method(parameters),
         parameters.get("agent"),
@@ -97,11 +97,6 @@ def _subject_text(record: KeyRecord) -> str:
     _, env, places, method, agent, *_ = _subject(record)
     texts = [places] if isinstance(places, str) else list(places or ())
     return " ".join(str(t) for t in (env, *texts, method, agent) if t and t != "policy")
-
-
-def _env(parameters: Mapping[str, Any]) -> str | None:
-    environment = parameters.get("environment")
-    return environment.get("name") if isinstance(environment, dict) else parameters.get("env")
 
 
 def _method(parameters: Mapping[str, Any]) -> str | None:

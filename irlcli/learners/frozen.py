@@ -32,8 +32,7 @@ class FrozenReward:
             no bound, as it was learned.
 
     Raises:
-        UsageError: the reward takes other observations or actions, or has no quantiles for a
-            ceiling.
+        UsageError: the reward takes other observations or actions.
     """
 
     def __init__(
@@ -61,15 +60,7 @@ class FrozenReward:
                 f"the reward takes {_actions(network)}, but {where} has {_actions(actions)}",
                 "a reward belongs to the environment it was learned in",
             )
-        self._ceiling = math.inf
-        if ceiling is not None:
-            if origin.quantiles is None:
-                raise UsageError(
-                    f"transfer.ceiling = {ceiling:g} needs the quantiles of g on the "
-                    "demonstrations, which this reward's file does not hold",
-                    "learn the reward again with irl train-airl, or omit transfer.ceiling",
-                )
-            self._ceiling = level_of(origin.quantiles, ceiling)
+        self._ceiling = math.inf if ceiling is None else level_of(origin.quantiles, ceiling)
         self._model = model
         self._scale = origin.scale
         self._horizon = horizon

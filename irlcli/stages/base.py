@@ -247,8 +247,7 @@ def frozen_reward(
     ``gamma`` is the discount of a policy that is trained on it; by default that of its shaping.
 
     Raises:
-        UsageError: the reward takes other observations or actions, or has no quantiles for a
-            ceiling.
+        UsageError: the reward takes other observations or actions.
     """
     from contextlib import closing
 

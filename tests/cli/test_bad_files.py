@@ -144,7 +144,8 @@ def description(**changes) -> bytes:
     """A reward file of no parameters that describes itself as ``changes`` say."""
     origin = {"env": "lunar-lander", "settings": ["engine-power=1x"], "method": "erm", "seed": 0}
     # Sound but for the changes, so that each of them is what is refused.
-    origin |= {"network": NETWORK, "scale": 1.0, "airl": {"fixed_horizon": True}}
+    origin |= {"network": NETWORK, "scale": 1.0, "quantiles": [0.0] * 101}
+    origin |= {"airl": {"fixed_horizon": True}}
     origin = {name: value for name, value in {**origin, **changes}.items() if value is not Ellipsis}
     return tensor_file(description=json.dumps(origin))
 

@@ -167,6 +167,7 @@ def continuous(path, actions, numbers=None):
         airl=settings,
         network=network,
         scale=2.0,
+        quantiles=tuple(np.linspace(0.0, 1.0, 101).tolist()),
     )
     model = build(**asdict(network))
     state = {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
@@ -310,13 +311,3 @@ def test_a_trained_reward_carries_its_quantiles_and_a_ceiling_bounds_what_it_pay
     bound = quantiles[50] / origin.scale
     assert rewards[None].max() > bound
     np.testing.assert_allclose(rewards[0.5], np.minimum(rewards[None], bound), rtol=1e-5)
-
-
-def test_a_ceiling_needs_a_reward_with_quantiles(tmp_path):
-    continuous(tmp_path / "reward.pt", "executed")
-    model, origin = load_reward_file(tmp_path / "reward.pt")
-    with pytest.raises(
-        UsageError, match="needs the quantiles of g on the demonstrations"
-    ) as caught:
-        FrozenReward(model, origin, 1000, 0.9, "x", 1, BOX, 0.9)
-    assert "omit transfer.ceiling" in caught.value.hint
