@@ -6,7 +6,7 @@ The bank only measures: no reward and no policy learns from it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from irlcli.data.descriptions import Reward
     from irlcli.learners.reward_model import RewardModule
+    from irlcli.report.reward_quality import Member
     from irlcli.trajectories import Trajectory
 
 
@@ -96,11 +97,8 @@ def run(job: Job) -> None:
     from irlcli.data.tensors import load_reward_file
     from irlcli.report import scatter
     from irlcli.report.assessment import assess
-    from irlcli.report.reward_quality import Member
-    from irlcli.store import read_json
 
     p: Parameters = job.parameters
-    env, horizon = p.environment.name, p.environment.max_episode_steps
     model, origin = load_reward_file(job.inputs["reward"])
     episodes = {entry: _episodes(job, entry) for entry in p.bank}
     experts = {entry.setting: entry for entry in p.bank if entry.kind == "expert"}
@@ -112,18 +110,8 @@ def run(job: Job) -> None:
     members, rows = [], []
     for index, entry in enumerate(p.bank):
         # What an absorbing state earns counts up to the horizon.
-        absorbing = origin.airl.fixed_horizon
-        member = Member(
-            policy=entry.policy,
-            kind=entry.kind,
-            setting=entry.setting,
-            true=np.array([t.episode_return for t in episodes[entry]]),
-            learned=returns(entry),
-            steps=np.array(
-                [horizon if absorbing and t.terminated else len(t) for t in episodes[entry]]
-            ),
-            progress=read_json(job.inputs[entry.role] / "summary.json")["mean_progress"],
-        )
+        horizon = p.environment.max_episode_steps if origin.airl.fixed_horizon else None
+        member = _member(job, entry, episodes[entry], returns(entry), horizon)
         if entry.ceiling is not None and entry.setting in experts:
             member = member._replace(
                 ceiling=entry.ceiling,
@@ -131,26 +119,55 @@ def run(job: Job) -> None:
                 expert_paid=returns(experts[entry.setting], entry.ceiling),
             )
         members.append(member)
-        rows += [
-            {
-                "setting": entry.setting,
-                "policy": entry.policy,
-                "kind": entry.kind,
-                "episode": k,
-                "true_return": float(member.true[k]),
-                "learned_return": float(member.learned[k]),
-                "length": len(t),
-                "terminated": t.terminated,
-            }
-            for k, t in enumerate(episodes[entry])
-        ]
+        rows += _rows(member, episodes[entry])
         job.console.progress(index + 1, len(p.bank), "policies", {})
     reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)
     epic, epic_missing = _epic_distances(p.environment, model, origin, episodes)
-    assessment = assess(env, reward, members, epic, epic_missing)
+    assessment = assess(p.environment.name, reward, members, epic, epic_missing)
     write_json(job.output / "assessment.json", msgspec.to_builtins(assessment))
     write_table(pa.Table.from_pylist(rows), job.output / "bank.parquet")
     scatter.draw_bank(job.output, assessment)
+
+
+def _member(
+    job: Job,
+    entry: Entry,
+    episodes: Sequence[Trajectory],
+    learned: np.ndarray,
+    horizon: int | None,
+) -> Member:
+    """``entry`` with its returns; ``horizon`` counts for an episode that ended, None for none."""
+    import numpy as np
+
+    from irlcli.report.reward_quality import Member
+    from irlcli.store import read_json
+
+    return Member(
+        policy=entry.policy,
+        kind=entry.kind,
+        setting=entry.setting,
+        true=np.array([t.episode_return for t in episodes]),
+        learned=learned,
+        steps=np.array([horizon if horizon and t.terminated else len(t) for t in episodes]),
+        progress=read_json(job.inputs[entry.role] / "summary.json")["mean_progress"],
+    )
+
+
+def _rows(member: Member, episodes: Sequence[Trajectory]) -> list[dict[str, Any]]:
+    """A row per episode."""
+    return [
+        {
+            "setting": member.setting,
+            "policy": member.policy,
+            "kind": member.kind,
+            "episode": k,
+            "true_return": float(member.true[k]),
+            "learned_return": float(member.learned[k]),
+            "length": len(t),
+            "terminated": t.terminated,
+        }
+        for k, t in enumerate(episodes)
+    ]
 
 
 def _episodes(job: Job, entry: Entry) -> Sequence[Trajectory]:
