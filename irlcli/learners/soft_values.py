@@ -91,7 +91,27 @@ def solve(
         total += largest
         value = total + flat
         value[ended] = flat[ended]
-    state = columns(settings, np.broadcast_to(settings.start, (value.size // (e * n), e, n)))
+    occupancy = _occupancy(settings, log_weight, log_total, scales, each)
+    return Solution(
+        settings=settings,
+        log_weight=log_weight.reshape(horizon, afterstates, -1),
+        log_total=log_total.reshape(horizon, e * n, -1),
+        log_partition=(runs_first(settings, value) * settings.start).sum(-1),
+        occupancy=runs_first(settings, occupancy),
+    )
+
+
+def _occupancy(
+    settings: StackedMDPs,
+    log_weight: np.ndarray,
+    log_total: np.ndarray,
+    scales: list[np.ndarray | None],
+    each: np.ndarray,
+) -> np.ndarray:
+    """The forward pass of :func:`solve`; ``each`` [A, E * S, ...] is overwritten."""
+    e, n, a = settings.shape
+    runs = log_total[0].size // (e * n)
+    state = columns(settings, np.broadcast_to(settings.start, (runs, e, n)))
     occupancy = state.copy()
     for t, scale in enumerate(scales):
         if scale is not None:
@@ -104,10 +124,4 @@ def solve(
             arriving = settings.collect @ each.reshape(a * e * n, *state.shape[1:])
         state = settings.spread_transposed @ arriving
         occupancy += state
-    return Solution(
-        settings=settings,
-        log_weight=log_weight.reshape(horizon, afterstates, -1),
-        log_total=log_total.reshape(horizon, e * n, -1),
-        log_partition=(runs_first(settings, value) * settings.start).sum(-1),
-        occupancy=runs_first(settings, occupancy),
-    )
+    return occupancy
