@@ -55,9 +55,14 @@ def to_bytes(value: Any) -> bytes:
     return buffer.getvalue()
 
 
-def byte_tensor(data: bytes) -> torch.Tensor:
-    """``data`` as a tensor [len(data)] uint8."""
-    return torch.frombuffer(bytearray(data), dtype=torch.uint8)
+def json_tensor(value: Any) -> torch.Tensor:
+    """``value`` as one tensor uint8: rows grow with the rounds, the number of tensors does not."""
+    return torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+
+
+def json_value(tensor: torch.Tensor) -> Any:
+    """What :func:`json_tensor` holds."""
+    return json.loads(tensor.numpy().tobytes())
 
 
 def from_bytes(data: bytes) -> Any:
@@ -116,15 +121,15 @@ def restore(data: bytes | None, names: set[str], discard: Callable[[str], None])
 
 
 @contextmanager
-def fitting(directory: Path, *errors: type[Exception]) -> Iterator[None]:
-    """Report ``errors`` as a checkpoint in the scratch ``directory`` that does not fit its stage.
+def fitting(directory: Path) -> Iterator[None]:
+    """Report errors as a checkpoint in the scratch ``directory`` that does not fit its stage.
 
     Raises:
-        IntegrityError: instead of one of ``errors``.
+        IntegrityError: instead of any error: a crafted state can make torch and Python raise all.
     """
     try:
         yield
-    except errors as error:
+    except Exception as error:
         raise IntegrityError(
             f"the checkpoint in {directory} does not fit its stage ({type(error).__name__})",
             "remove that directory, then run the same command again to start over",

@@ -78,8 +78,7 @@ def _experts(
     experts: dict[str, ExpertConfig] = {}
     for row in plan.table.rows:
         config = plan.configs(row.env)
-        listed = config.interventions.get(row.knob)
-        own = None if listed is None else listed.expert
+        own = config.interventions[row.knob].expert
         experts[f"{row.env} {row.knob}"] = config.expert if own is None else own
     parameters = report_experts.Parameters(
         command=command,

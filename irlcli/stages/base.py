@@ -5,7 +5,6 @@ and cache hits import every stage module, so each imports torch, gymnasium, pyar
 inside ``run`` only.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -187,14 +186,12 @@ def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
 
     state = tensors.restore(job.checkpoints.load(), {"training", "rows"}, job.checkpoints.discard)
     if state is not None:
-        # A crafted state can make torch and Python raise anything.
-        with tensors.fitting(job.output.parent, Exception):
-            rows = json.loads(state["rows"].numpy().tobytes())
+        with tensors.fitting(job.output.parent):
+            rows = tensors.json_value(state["rows"])
             training.load_state_dict(state["training"], rows)
 
     def encoded() -> bytes:
-        # Rows as one tensor: they grow with the rounds, the number of tensors does not.
-        rows = tensors.byte_tensor(json.dumps(training.rows).encode())
+        rows = tensors.json_tensor(training.rows)
         return tensors.to_bytes({"training": training.state_dict(), "rows": rows})
 
     def after_round(_: "Training | Restarts", newest: "list[Row]") -> None:
@@ -221,11 +218,11 @@ def run_parts(
     from irlcli.data import tensors
 
     state = tensors.restore(job.checkpoints.load(), {"rows"}, job.checkpoints.discard)
-    with tensors.fitting(job.output.parent, Exception):
-        done = [] if state is None else json.loads(state["rows"].numpy().tobytes())
+    with tensors.fitting(job.output.parent):
+        done = [] if state is None else tensors.json_value(state["rows"])
 
     def encoded() -> bytes:
-        return tensors.to_bytes({"rows": tensors.byte_tensor(json.dumps(done).encode())})
+        return tensors.to_bytes({"rows": tensors.json_tensor(done)})
 
     for part in parts[len(done) :]:
         done.append(rows(part))

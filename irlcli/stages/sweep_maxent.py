@@ -143,7 +143,7 @@ def run(job: Job) -> None:
         demos[seed] = indexed(settings, episodes, p.gridworld)
     penalties = list(dict.fromkeys(v.penalty for v in p.variants))
     state = tensors.restore(job.checkpoints.load(), {"rewards", "fit"}, job.checkpoints.discard)
-    with tensors.fitting(job.output.parent, Exception):
+    with tensors.fitting(job.output.parent):
         rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
     runs: list[tuple[Variant, int]] = []
     for k, penalty in enumerate(penalties):
@@ -199,7 +199,7 @@ def _fit(
     each = [(replace(p.shared, **asdict(v)), demos[seed], seed) for v, seed in runs]
     learner = side_by_side(settings, p.gridworld, each)
     if state is not None:
-        with tensors.fitting(job.output.parent, Exception):
+        with tensors.fitting(job.output.parent):
             learner.load_state_dict(state)
     # Larger fits take longer, so progress counts iterations of single rewards.
     before = p.shared.iterations * sum(map(len, rewards))

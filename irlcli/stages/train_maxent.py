@@ -102,7 +102,7 @@ def run(job: Job) -> None:
     names = set(learner.state_dict())
     state = tensors.restore(job.checkpoints.load(), names, job.checkpoints.discard)
     if state is not None:
-        with tensors.fitting(job.output.parent, Exception):
+        with tensors.fitting(job.output.parent):
             learner.load_state_dict(state)
 
     def after_record() -> None:
