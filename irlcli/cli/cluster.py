@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from irlcli.cli import console as out
 from irlcli.cli.session import Session, StageSession
 from irlcli.errors import StageFailed, UsageError, suggest
+from irlcli.experiments.cluster.resources import DEFAULT_TIME, Resources, parse_minutes
 
 if TYPE_CHECKING:
     from irlcli.experiments.cluster.queue import Queue
@@ -19,8 +20,7 @@ if TYPE_CHECKING:
     from irlcli.experiments.runner import Runner
 
 CLUSTERS = ("slurm", "local")
-DEFAULT_TIME, DEFAULT_CPUS, DEFAULT_PARALLELISM, DEFAULT_REQUEUES = "4:00:00", 1, 50, 20
-_WARNING_SECONDS = 90
+DEFAULTS, DEFAULT_REQUEUES = Resources(), 20
 # Options of sbatch that every job has already, and the option of irl run that changes them.
 _SET_BY_IRL = {
     "array": "--array-parallelism",
@@ -91,7 +91,6 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     """
     cluster = options.cluster or "slurm"
     from irlcli.experiments.cluster.local import Local
-    from irlcli.experiments.cluster.resources import Resources, parse_minutes
     from irlcli.experiments.cluster.slurm import Slurm
 
     if cluster not in CLUSTERS:
@@ -103,12 +102,12 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
         )
     minutes = parse_minutes(options.time or DEFAULT_TIME)
     # A job of few minutes is warned when half of them are over.
-    warning = min(_WARNING_SECONDS, 30 * minutes)
+    warning = min(DEFAULTS.warning, 30 * minutes)
     resources = Resources(
         options.partition,
         minutes,
-        options.cpus or DEFAULT_CPUS,
-        options.parallelism or DEFAULT_PARALLELISM,
+        options.cpus or DEFAULTS.cpus,
+        options.parallelism or DEFAULTS.parallelism,
         warning,
         dict(_sbatch_option(item) for item in options.sbatch),
     )
@@ -203,16 +202,15 @@ def ended_submissions(session: Session, grace_seconds: float) -> list[Path]:
     """What gc may remove of the store's records of submissions."""
     from irlcli.experiments.cluster.local import Local
     from irlcli.experiments.cluster.records import ended
-    from irlcli.experiments.cluster.resources import Resources
     from irlcli.experiments.cluster.slurm import Slurm
 
     @cache
     def states_at(place: str) -> Mapping[str, str] | None:
-        local = Local(session.store, Resources())
+        local = Local(session.store, DEFAULTS)
         if place == local.place:
             return local.states()
         try:
-            slurm = Slurm(Resources())
+            slurm = Slurm(DEFAULTS)
             return slurm.states() if place == slurm.place else None
         except (UsageError, StageFailed):
             return None

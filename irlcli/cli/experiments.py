@@ -149,7 +149,7 @@ def run(
         int | None,
         typer.Option(
             min=1,
-            help=f"CPUs of a job. Default: {cluster_jobs.DEFAULT_CPUS}.",
+            help=f"CPUs of a job. Default: {cluster_jobs.DEFAULTS.cpus}.",
             rich_help_panel=_JOBS,
         ),
     ] = None,
@@ -157,7 +157,7 @@ def run(
         int | None,
         typer.Option(
             min=1,
-            help=f"Jobs of an array that run at a time. Default: {cluster_jobs.DEFAULT_PARALLELISM}.",
+            help=f"Jobs of an array that run at a time. Default: {cluster_jobs.DEFAULTS.parallelism}.",
             rich_help_panel=_JOBS,
         ),
     ] = None,

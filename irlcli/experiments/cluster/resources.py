@@ -6,30 +6,7 @@ from typing import NamedTuple
 
 from irlcli.errors import UsageError
 
-
-class Resources(NamedTuple):
-    """What every job asks for.
-
-    Attributes:
-        minutes: time limit.
-        cpus: per job.
-        parallelism: elements of an array that run at a time.
-        warning: how long before the time limit a job is warned [s].
-        extra: other options of sbatch, by name.
-    """
-
-    partition: str | None = None
-    minutes: int = 240
-    cpus: int = 1
-    parallelism: int = 50
-    warning: int = 90
-    extra: Mapping[str, str] = {}
-
-    def words(self) -> list[str]:
-        """The options of srun for the same place and size."""
-        words = [] if self.partition is None else [f"--partition={self.partition}"]
-        words.append(f"--cpus-per-task={self.cpus}")
-        return words + [f"--{name}={value}" for name, value in self.extra.items()]
+DEFAULT_TIME = "4:00:00"
 
 
 def parse_minutes(text: str) -> int:
@@ -51,3 +28,28 @@ def parse_minutes(text: str) -> int:
     if seconds < 60:
         raise UsageError(f"--time {text} is less than a minute", "for example 4:00:00")
     return -(-seconds // 60)
+
+
+class Resources(NamedTuple):
+    """What every job asks for.
+
+    Attributes:
+        minutes: time limit.
+        cpus: per job.
+        parallelism: elements of an array that run at a time.
+        warning: how long before the time limit a job is warned [s].
+        extra: other options of sbatch, by name.
+    """
+
+    partition: str | None = None
+    minutes: int = parse_minutes(DEFAULT_TIME)
+    cpus: int = 1
+    parallelism: int = 50
+    warning: int = 90
+    extra: Mapping[str, str] = {}
+
+    def words(self) -> list[str]:
+        """The options of srun for the same place and size."""
+        words = [] if self.partition is None else [f"--partition={self.partition}"]
+        words.append(f"--cpus-per-task={self.cpus}")
+        return words + [f"--{name}={value}" for name, value in self.extra.items()]
