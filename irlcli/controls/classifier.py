@@ -13,27 +13,12 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import dropout
 
+from irlcli.controls.variants import Method
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
 from irlcli.penalties.risk import cross_entropy
 
 # Sums over weights or over samples: of all runs together they are the sum of each run's.
 _ADDITIVE = ("iga", "input-gradient", "l2")
-
-
-class Method(NamedTuple):
-    """What is added to the mean risk of the settings.
-
-    Attributes:
-        penalty: a key of :data:`irlcli.penalties.PENALTIES` that adversarial learners have.
-        weight: lambda.
-        shuffled: whether samples are dealt out to the settings at random (the control).
-        dropout: share of the hidden units that each step drops.
-    """
-
-    penalty: str = "none"
-    weight: float = 0.0
-    shuffled: bool = False
-    dropout: float = 0.0
 
 
 class Schedule(NamedTuple):

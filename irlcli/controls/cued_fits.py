@@ -17,6 +17,7 @@ from irlcli.controls.cued_maps import (
     pays,
     torus,
 )
+from irlcli.controls.variants import Variant
 from irlcli.learners.maxent import MaxEnt, Risks, group_risks
 from irlcli.learners.occupancy import Demonstrations
 from irlcli.learners.soft_values import solve
@@ -51,22 +52,6 @@ class Fit(NamedTuple):
     iterations: int
     warmup: int
     learning_rate: float
-
-
-class Variant(NamedTuple):
-    """A method. The first four fields are those of :class:`irlcli.configs.MaxEntConfig`.
-
-    Attributes:
-        warm: lambda is zero for the warm-up; otherwise it is there from the start.
-        sees: ``all``, or ``texture``: the invariant reward, which a learner cannot know to be it.
-    """
-
-    grouping: str
-    penalty: str = "none"
-    penalty_weight: float = 0.0
-    l2: float = 0.0
-    warm: bool = True
-    sees: str = "all"
 
 
 class Dataset(NamedTuple):

@@ -8,6 +8,7 @@ import msgspec
 from msgspec.structs import replace
 
 from irlcli.configs import CuedLabelsConfig
+from irlcli.controls.variants import Method
 from irlcli.errors import UsageError
 from irlcli.penalties import PENALTIES
 from irlcli.stages.base import Job, Request, Stage, run_parts
@@ -15,29 +16,6 @@ from irlcli.stages.base import Job, Request, Stage, run_parts
 DIGITS = "coloured digits"
 PROBLEMS = (DIGITS, "example 2", "example 3")
 _DEFAULT = CuedLabelsConfig()
-
-
-class Method(msgspec.Struct, frozen=True, kw_only=True):
-    """A method; the fields are those of :class:`irlcli.controls.classifier.Method`.
-
-    ``oracle`` learns from samples whose spurious inputs are permuted.
-    """
-
-    penalty: str = "none"
-    weight: float = 0.0
-    shuffled: bool = False
-    dropout: float = 0.0
-    oracle: bool = False
-
-    def __str__(self) -> str:
-        """For example ``irmv1 100, labels shuffled``."""
-        if self.oracle:
-            return "oracle"
-        if self.dropout:
-            return f"dropout {self.dropout:g}"
-        if self.penalty == "none":
-            return "erm"
-        return f"{self.penalty} {self.weight:g}" + ", labels shuffled" * self.shuffled
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -121,7 +99,7 @@ def run(job: Job) -> None:
     def rows_of(method: Method) -> list[dict[str, Any]]:
         networks = classifier.train(
             invariant if method.oracle else trained,
-            classifier.Method(method.penalty, method.weight, method.shuffled, method.dropout),
+            method,
             schedule,
             hidden,
             seeds,

@@ -9,31 +9,12 @@ import msgspec
 from msgspec.structs import replace
 
 from irlcli.configs import CuedMapsConfig
+from irlcli.controls.variants import Variant
 from irlcli.errors import UsageError
 from irlcli.penalties import PENALTIES
 from irlcli.stages.base import Job, Request, Stage, run_parts
 
 _DEFAULT = CuedMapsConfig()
-_NAMES = {"pooled": "erm", "balanced": "erm-balanced"}
-
-
-class Variant(msgspec.Struct, frozen=True, kw_only=True):
-    """A method; the fields are those of :class:`irlcli.controls.cued_fits.Variant`."""
-
-    grouping: str = "per-setting"
-    penalty: str = "none"
-    penalty_weight: float = 0.0
-    l2: float = 0.0
-    warm: bool = True
-    sees: str = "all"
-
-    def __str__(self) -> str:
-        """For example ``irmv1-full 100, labels shuffled``."""
-        text = _NAMES.get(self.grouping, f"{self.penalty} {self.penalty_weight:g}")
-        text += f" + l2 {self.l2:g}" if self.l2 else ""
-        text += ", labels shuffled" if self.grouping == "shuffled" else ""
-        text += "" if self.warm else ", no warm-up"
-        return text + (", sees the texture only" if self.sees == "texture" else "")
 
 
 _ERM, _BALANCED = Variant(grouping="pooled"), Variant(grouping="balanced")
@@ -259,11 +240,10 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
             ends = min(case.strengths), max(case.strengths)
             strengths[r] = rng.uniform(*ends, strengths[r].shape)
     data = cued_fits.dataset(world, strengths, seeds)
-    variants = [cued_fits.Variant(**msgspec.structs.asdict(v)) for v in case.variants]
     rows = []
     for left_out in (-1, *(range(len(case.strengths)) if case.leave_out else ())):
         kept = data if left_out < 0 else cued_fits.without(data, left_out)
-        fitted = cued_fits.fit(world, kept, variants, how, seeds)
+        fitted = cued_fits.fit(world, kept, case.variants, how, seeds)
         paid = cued_fits.paid(fitted)
         measures = {
             **cued_fits.unseen(world, fitted, seeds, case.colours)._asdict(),

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from irlcli.controls.classifier import Method, Networks, Schedule, accuracy, train
+from irlcli.controls.classifier import Networks, Schedule, accuracy, train
 from irlcli.controls.cued_labels import UNIT_TESTS, coloured_digits, permuted, unit_test
+from irlcli.controls.variants import Method
 from irlcli.penalties import PENALTIES
 
 SEEDS = range(10)

@@ -6,7 +6,6 @@ import torch
 
 from irlcli.controls.cued_fits import (
     Fit,
-    Variant,
     World,
     dataset,
     fit,
@@ -16,6 +15,7 @@ from irlcli.controls.cued_fits import (
     without,
 )
 from irlcli.controls.cued_maps import draw, features, torus
+from irlcli.controls.variants import Variant
 from irlcli.learners.maxent import MaxEnt, Risks
 from irlcli.learners.soft_values import solve
 
