@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-DENSE_LIMIT = 1024  # states; with four actions that takes 32 MiB
 MEMORY_LIMIT = 8 * 2**30  # bytes
 TIE_TOLERANCE = 1e-9  # relative: actions whose values differ by less are equally good
 
@@ -86,15 +85,7 @@ class TabularMDP:
 
 
 def dense_transitions(mdp: TabularMDP) -> np.ndarray:
-    """P(s'|s, a) as [A, S, S] float64, for small cases and for checks.
-
-    Raises:
-        ValueError: more than ``DENSE_LIMIT`` states.
-    """
-    if mdp.n_states > DENSE_LIMIT:
-        raise ValueError(
-            f"{mdp.n_states} states are too many for dense transitions (at most {DENSE_LIMIT})"
-        )
+    """P(s'|s, a) as [A, S, S] float64: a reference for tests and benchmarks of small cases."""
     spread = np.zeros((len(mdp.successor), mdp.n_states))
     rows = np.broadcast_to(np.arange(len(spread))[:, None], mdp.successor.shape)
     np.add.at(spread, (rows, mdp.successor), mdp.probability)

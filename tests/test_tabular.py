@@ -9,7 +9,6 @@ import pytest
 
 from irlcli.envs.gridworld.env import gridworld
 from irlcli.tabular import (
-    DENSE_LIMIT,
     TabularMDP,
     backward,
     dense_transitions,
@@ -104,13 +103,6 @@ def test_the_intended_path_ignores_slips_and_stays_at_the_goal():
     up, right = np.eye(4)[0], np.eye(4)[1]
     policy = np.stack([right, up, right, up, up])[:, :, None].repeat(9, axis=2)
     assert intended_path(mdp, policy).tolist() == [0, 1, 4, 5, 8, 8]
-
-
-def test_a_grid_too_large_for_the_dense_solver_is_refused():
-    large = gridworld(33)
-    assert large.n_states > DENSE_LIMIT
-    with pytest.raises(ValueError, match="too many for dense"):
-        dense_transitions(large)
 
 
 def test_a_grid_too_large_for_the_exact_solver_is_refused():
