@@ -235,6 +235,15 @@ def parse_settings(env: str, text: str) -> tuple[Setting, ...]:
     return tuple(settings)
 
 
+def listed_settings(env: str, knob: str, values: Sequence[str]) -> tuple[Setting, ...]:
+    """A setting for each of the ``values`` that a settings file lists for ``knob``.
+
+    Raises:
+        UsageError: as :func:`parse_settings`.
+    """
+    return parse_settings(env, f"{knob}={','.join(values)}") if values else ()
+
+
 def check_distinct(where: str, settings: Sequence[Setting]) -> None:
     """Refuse settings that are the same world.
 

@@ -14,7 +14,7 @@ from irlcli.envs.announced import announced
 from irlcli.envs.registry import ENVIRONMENTS, environment, resolve
 from irlcli.envs.spec import EnvironmentSpec
 from irlcli.errors import IrlError, StageFailed, UsageError, suggest
-from irlcli.interventions import parse_settings
+from irlcli.interventions import listed_settings
 
 _ACTIONS = ("list", "show", "check")
 
@@ -131,9 +131,8 @@ def _check(session: Session, spec: EnvironmentSpec, config: Config) -> None:
     from irlcli.envs.check import Found, check
 
     listed = {
-        knob: parse_settings(spec.name, f"{knob}={','.join((*values.id, *values.ood))}")
+        knob: listed_settings(spec.name, knob, (*values.id, *values.ood))
         for knob, values in config.interventions.items()
-        if values.id or values.ood
     }
     outcomes: list[Found] = []
     for found in check(spec, listed):

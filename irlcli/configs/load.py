@@ -24,7 +24,7 @@ from irlcli.configs.schema import (
 )
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, of_types, suggest
-from irlcli.interventions import knob_of, overlap, parse_settings
+from irlcli.interventions import Setting, knob_of, listed_settings, overlap
 
 PROFILES = ("smoke", "standard", "paper")
 
@@ -88,6 +88,15 @@ def load_config(
         if value is not None
     ]
     return _stack(env, layers)
+
+
+def unseen_settings(env: str, config: Config) -> list[Setting]:
+    """Every OOD setting that the settings file lists."""
+    return [
+        setting
+        for knob, values in config.interventions.items()
+        for setting in listed_settings(env, knob, values.ood)
+    ]
 
 
 def in_profile(source: str, tree: Mapping[str, Any], profile: str) -> list[Layer]:
@@ -254,10 +263,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
         raise UsageError(f"{field}: {of_types(message)}", _field_hint(field)) from None
     check_registered(config)
     for knob, values in config.interventions.items():
-        trained, unseen = (
-            parse_settings(env, f"{knob}={','.join(part)}") if part else ()
-            for part in (values.id, values.ood)
-        )
+        trained, unseen = (listed_settings(env, knob, part) for part in (values.id, values.ood))
         if len(values.episodes) not in (0, 1, len(trained)):
             raise UsageError(
                 f"interventions.{knob}.episodes: {len(values.episodes)} episode counts for "

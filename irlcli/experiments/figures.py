@@ -1,6 +1,6 @@
 """The tasks of results that have no rows: Figure 2 and the exact positive controls."""
 
-from irlcli.configs.load import CONTROL
+from irlcli.configs.load import CONTROL, unseen_settings
 from irlcli.experiments.rows import Task, made_by
 from irlcli.experiments.variants import Configs
 from irlcli.interventions import parse_settings
@@ -13,12 +13,7 @@ def gridworld_figure(configs: Configs) -> tuple[list[Task], Request]:
     env = "gridworld"
     config = configs(env, None)
     trained = parse_settings(env, f"path-group={','.join(config.interventions['path-group'].id)}")
-    unseen = [
-        setting
-        for knob, listed in config.interventions.items()
-        if listed.ood
-        for setting in parse_settings(env, f"{knob}={','.join(listed.ood)}")
-    ]
+    unseen = unseen_settings(env, config)
     figure = figure2.request(env, trained, unseen, config)
     sweep = made_by(figure.inputs["sweep"])
     tasks = [

@@ -15,7 +15,7 @@ from irlcli.experiments import facts
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import Task, made_by
 from irlcli.experiments.status import source_in
-from irlcli.interventions import parse_settings
+from irlcli.interventions import listed_settings
 from irlcli.report.parameters import ASSESS, CUE, Cell, Row
 from irlcli.stages import report, report_experts
 from irlcli.stages.base import Request, Source
@@ -159,8 +159,7 @@ def _rows(plan: Plan) -> list[Row]:
         config = plan.configs(row.env)
         listed = config.interventions[row.knob]
         trained, unseen = (
-            parse_settings(row.env, f"{row.knob}={','.join(values)}")
-            for values in (listed.id, listed.ood)
+            listed_settings(row.env, row.knob, values) for values in (listed.id, listed.ood)
         )
         demos = plan.tasks[f"{plan.selection.tag}.{row}.demos"].request
         tree = msgspec.to_builtins(config) | {

@@ -29,7 +29,7 @@ from irlcli.experiments.bank import Policies, Retrained, bank
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
 from irlcli.experiments.variants import Configs
-from irlcli.interventions import Setting, parse_settings
+from irlcli.interventions import Setting, listed_settings
 from irlcli.methods import fields, method
 from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
 from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell
@@ -124,7 +124,7 @@ class _RowRequests:
             )
         self.listed = self.config.interventions[row.knob]
         self.trained, self.unseen = (
-            parse_settings(row.env, f"{row.knob}={','.join(values)}") if values else ()
+            listed_settings(row.env, row.knob, values)
             for values in (self.listed.id, self.listed.ood)
         )
         self._experts: dict[Setting, Request] = {}

@@ -15,6 +15,7 @@ from irlcli.interventions import (
     check_observed,
     examples_of,
     knob_of,
+    listed_settings,
     parse_setting,
     parse_settings,
 )
@@ -60,7 +61,7 @@ def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
                 f"the settings file lists no {kind.upper()} values of {text!r}",
                 f"write {text}=VALUE,VALUE",
             )
-        return parse_settings(env, f"{text}={','.join(values)}")
+        return listed_settings(env, text, values)
     if origin is None and not text.strip():
         option = "--ood" if kind == "ood" else "--intervention"
         raise UsageError(f"{option} is empty", f"write {option} KNOB=VALUE,VALUE")
@@ -162,15 +163,6 @@ def _expert(env: str, text: str) -> tuple[Setting, str]:
         f"--expert {text!r}: {first.message if first else 'it names no setting'}",
         "write KNOB=VALUE=FILE, for example mass=1x=expert.zip",
     )
-
-
-def unseen_settings(env: str, config: "Config") -> list[Setting]:
-    """Every OOD setting that the settings file lists."""
-    return [
-        parse_setting(env, f"{knob}={value}")
-        for knob, values in config.interventions.items()
-        for value in values.ood
-    ]
 
 
 def env_name(ref: str | None) -> str | None:

@@ -2,6 +2,7 @@
 
 import msgspec
 
+from irlcli.configs.load import unseen_settings
 from irlcli.errors import UsageError
 from irlcli.experiments.references import demonstrations
 from irlcli.experiments.runner import source_of
@@ -118,5 +119,5 @@ def train_maxent(
     maxent = config.maxent
     arguments.check_weighted(f"{maxent.grouping} MaxEnt", maxent.penalty, penalty_weight)
     settings = [parse_setting(env, text) for text in texts]
-    unseen = arguments.unseen_settings(env, config)
+    unseen = unseen_settings(env, config)
     return maxent_stage.request(source, env, settings, unseen, maxent, seed)
