@@ -29,6 +29,11 @@ def mlp(inputs: int, hidden: Sequence[int], activation: str, dropout: float) -> 
     return nn.Sequential(*layers, nn.Linear(inputs, 1))
 
 
+def all_finite(module: nn.Module) -> bool:
+    """Whether every parameter is finite."""
+    return all(bool(torch.isfinite(p).all()) for p in module.parameters())
+
+
 class ObservationNormaliser(nn.Module):
     """Running mean and variance of observations, applied as (s - mean) / std and clipped.
 

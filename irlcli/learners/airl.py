@@ -60,6 +60,7 @@ from irlcli.learners.pools import (
 )
 from irlcli.learners.replay import Replay, whole_episodes
 from irlcli.learners.reward_model import AveragedReward, RewardModel, RewardModule
+from irlcli.networks import all_finite
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
 from irlcli.penalties.risk import cross_entropy
 from irlcli.seeds import derive
@@ -290,7 +291,7 @@ class AIRL:
                 self._optimizer.step()
                 losses.append((float(loss.cross_entropy), float(loss.penalty)))
         self.model.eval()
-        if not all(bool(torch.isfinite(p).all()) for p in self.model.parameters()):
+        if not all_finite(self.model):
             raise StageFailed(
                 f"the discriminator's parameters are not finite after round {index}",
                 "a smaller airl.learning_rate or airl.penalty_weight usually helps",

@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from irlcli.configs import PPOConfig
 from irlcli.errors import StageFailed
-from irlcli.networks import ACTIVATIONS
+from irlcli.networks import ACTIVATIONS, all_finite
 from irlcli.rl.policy import NormalisingExtractor, Policy, extractor
 from irlcli.rl.reward_normaliser import RunningDeviation
 from irlcli.rl.worlds import RecordingVecEnv, Worlds
@@ -147,7 +147,7 @@ class PPOTrainer:
                 self.model.ent_coef = self.ppo.ent_coef * remaining
             self.model.train()
             self.cap_noise()
-            if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
+            if not all_finite(self.model.policy):
                 raise StageFailed(
                     f"the policy's parameters are not finite after an update in round {index}",
                     "a smaller learning rate or gradient norm usually helps",

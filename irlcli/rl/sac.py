@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import Logger
 
 from irlcli.configs import SACConfig
 from irlcli.errors import StageFailed
-from irlcli.networks import ACTIVATIONS
+from irlcli.networks import ACTIVATIONS, all_finite
 from irlcli.rl.policy import NormalisingExtractor, Policy, SquashedPolicy, extractor
 from irlcli.rl.ppo import RewardSource
 from irlcli.rl.reward_normaliser import RunningDeviation
@@ -140,7 +140,7 @@ class SACTrainer:
             self._observe(rollout.observations.reshape(-1, rollout.observations.shape[-1]))
             if self.steps > self.sac.learning_starts:
                 self.model.train(self.sac.gradient_steps, self.sac.batch_size)
-                if not all(bool(torch.isfinite(p).all()) for p in self.model.policy.parameters()):
+                if not all_finite(self.model.policy):
                     raise StageFailed(
                         f"the networks' parameters are not finite after an update in round {index}",
                         "a smaller learning rate usually helps",
