@@ -14,7 +14,7 @@ from irlcli.stages import choose_penalty as choice
 from irlcli.stages import clone as clone_stage
 from irlcli.stages import train_airl as airl_stage
 from irlcli.stages import train_maxent as maxent_stage
-from irlcli.stages.base import Request
+from irlcli.stages.base import Request, Source
 from irlcli.store import Resolved, read_json
 
 
@@ -66,7 +66,7 @@ def train_airl(
     arguments.check_weighted(airl_stage.name(airl), airl.penalty, penalty_weight)
     # A bad option must fail before the choice of lambda, which takes long.
     airl_stage.request(source, env, settings, airl, seed)
-    basis = {}
+    basis: dict[str, Source] = {}
     if choose_penalty is not None:
         if penalty_weight is not None:
             raise UsageError(
@@ -75,18 +75,25 @@ def train_airl(
         arguments.check_chosen(choose_penalty, session.overrides)
         weights = arguments.weights(choose_penalty)
         request = choice.request(source, env, settings, airl, config.evaluation, weights, seed)
-        made = session.prepare(request, "train-airl")
-        if made is None:
+        chosen = _chosen(session, request)
+        if chosen is None:
             return None
-        path = session.store.open(made, "choice.json")
-        found = msgspec.convert(read_json(path), choice.Choice)
-        chosen = found.chosen
-        tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
-        tried = ",".join(f"{weight:g}" for weight in found.weights)
-        session.console.say(f"lambda {chosen:g} was the best of {tried}{tied} ({path})")
-        airl = msgspec.structs.replace(airl, penalty_weight=chosen)
-        basis["penalty choice"] = source_of(Resolved(made, path))
+        weight, basis["penalty choice"] = chosen
+        airl = msgspec.structs.replace(airl, penalty_weight=weight)
     return airl_stage.request(source, env, settings, airl, seed, basis)
+
+
+def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | None:
+    """The lambda that ``request`` chooses, and the file that says so; None if nothing may be run."""
+    made = session.prepare(request, "train-airl")
+    if made is None:
+        return None
+    path = session.store.open(made, "choice.json")
+    found = msgspec.convert(read_json(path), choice.Choice)
+    tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
+    tried = ",".join(f"{weight:g}" for weight in found.weights)
+    session.console.say(f"lambda {found.chosen:g} was the best of {tried}{tied} ({path})")
+    return found.chosen, source_of(Resolved(made, path))
 
 
 def train_maxent(

@@ -67,30 +67,7 @@ def request(
             settings.
     """
     texts = tuple(str(s) for s in settings)
-    if airl.penalty == "none":
-        raise UsageError("this method has no penalty to weigh", "--method irm has one")
-    penalty = PENALTIES[airl.penalty]
-    candidates = tuple(sorted(set(penalty.candidates if weights == "own" else weights)))
-    if len(texts) < 2:
-        raise UsageError(
-            f"{texts[0]} is the only setting, so none can be left out", "give --penalty-weight"
-        )
-    if len(candidates) < 2:
-        raise UsageError(
-            "--choose-penalty needs at least two candidates",
-            "for example --choose-penalty 0.1,1,10",
-        )
-    if penalty.compares and len(texts) < 3:
-        raise UsageError(
-            f"--choose-penalty leaves a setting out, and penalty {airl.penalty!r} compares at least "
-            f"two of the others: {len(texts)} settings are too few",
-            "give --penalty-weight, or collect demonstrations of a third setting",
-        )
-    if airl.select in texts:
-        raise UsageError(
-            f"--choose-penalty leaves every setting out in turn, also {airl.select}",
-            "select the last round, or by episodes",
-        )
+    candidates = _candidates(airl, texts, weights)
     inputs = {}
     for weight in candidates:
         config = msgspec.structs.replace(airl, penalty_weight=weight)
@@ -108,6 +85,37 @@ def request(
     )
     label = f"choose-penalty {train_airl.name(airl)} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, inputs, label)
+
+
+def _candidates(
+    airl: AIRLConfig, settings: Sequence[str], weights: Sequence[float] | Literal["own"]
+) -> tuple[float, ...]:
+    """The weights to compare, in order, after a check that settings can be left out."""
+    if airl.penalty == "none":
+        raise UsageError("this method has no penalty to weigh", "--method irm has one")
+    penalty = PENALTIES[airl.penalty]
+    candidates = tuple(sorted(set(penalty.candidates if weights == "own" else weights)))
+    if len(settings) < 2:
+        raise UsageError(
+            f"{settings[0]} is the only setting, so none can be left out", "give --penalty-weight"
+        )
+    if len(candidates) < 2:
+        raise UsageError(
+            "--choose-penalty needs at least two candidates",
+            "for example --choose-penalty 0.1,1,10",
+        )
+    if penalty.compares and len(settings) < 3:
+        raise UsageError(
+            f"--choose-penalty leaves a setting out, and penalty {airl.penalty!r} compares at least "
+            f"two of the others: {len(settings)} settings are too few",
+            "give --penalty-weight, or collect demonstrations of a third setting",
+        )
+    if airl.select in settings:
+        raise UsageError(
+            f"--choose-penalty leaves every setting out in turn, also {airl.select}",
+            "select the last round, or by episodes",
+        )
+    return candidates
 
 
 def _role(weight: float, setting: str) -> str:
