@@ -50,7 +50,6 @@ def transfer(
         named = arguments.named_settings(origin.env, config, intervention, "id", origin)
     elif ood is not None:
         named = arguments.named_settings(origin.env, config, ood, "ood", origin)
-        arguments.warn_of_seen(session.console, named, origin, reward)
     settings = arguments.with_several(origin.env, named, setting, origin)
     if len(settings) != 1:
         names = ", ".join(str(setting) for setting in settings)
@@ -58,6 +57,8 @@ def transfer(
             f"{options[0]} {given[options[0]]!r} names {len(settings)} settings: {names}",
             "transfer to one at a time",
         )
+    if ood is not None:
+        arguments.warn_of_seen(session.console, settings, origin, reward)
     label = reward_label(origin.airl, origin.seed)
     return stage.request(
         source,
