@@ -140,7 +140,8 @@ def _of_policy(
     settings: Sequence[Setting]
     if where.given:
         settings = where.settings(origin.env, config, origin)
-        if where.kind == "ood":
+        # A retrained policy was trained where its reward was not.
+        if where.kind == "ood" and origin.agent == "student":
             arguments.warn_of_seen(session.console, settings, origin, policy)
     else:
         settings = [parse_setting(origin.env, text) for text in origin.settings]

@@ -131,7 +131,7 @@ def test_what_a_reference_may_be_is_in_the_hint(irl, store_copy):
 def session(store, profile="standard", overrides=()):
     fixed = {"file": None, "sources": (), "dry_run": True, "wait": True, "workers": 1}
     return StageSession(
-        store, profile=profile, overrides=overrides, quiet=True, tensorboard=None, **fixed
+        store, False, profile=profile, overrides=overrides, quiet=True, tensorboard=None, **fixed
     )
 
 
