@@ -127,7 +127,9 @@ def _build_chain(store: Path) -> dict[str, str]:
 def store_copy(smoke_store: SmokeStore, tmp_path: Path) -> SmokeStore:
     """A copy of the smoke store that a test may change."""
     path = tmp_path / "runs"
-    shutil.copytree(smoke_store.path, path, symlinks=True)
+    # Another worker may be reading the store; its mark there comes and goes.
+    passing = shutil.ignore_patterns(".reader.*")
+    shutil.copytree(smoke_store.path, path, symlinks=True, ignore=passing)
     return SmokeStore(**{**asdict(smoke_store), "path": path})
 
 
