@@ -81,7 +81,8 @@ _CELL_NOTE = (
 )
 _BUDGET_NOTE = (
     "Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
-    "where the table has its own, by method and seed where it was chosen by leaving a setting out. Round: the one that was kept."
+    "where the table has its own, by method and seed where it was chosen by leaving a setting out. Round: the one that was kept. "
+    "At most: training could end earlier by airl.plateau_rounds; `stopped_after` in reward.json is the round."
 )
 _COST_NOTE = (
     "Wall-clock time of one process on a machine shared with other runs. A resumed run counts each "
@@ -346,7 +347,8 @@ def budgets(p: Parameters) -> Table:
                 row.name,
                 f"{config['expert']['total_steps']:,}",
                 ", ".join(map(str, row.demonstrations)),
-                f"{config['airl']['total_steps']:,}",
+                ("at most " if config["airl"].get("plateau_rounds") else "")
+                + f"{config['airl']['total_steps']:,}",
                 ", ".join(
                     [
                         f"{config['airl']['penalty_weight']:g}",

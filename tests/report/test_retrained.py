@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from msgspec.structs import replace
 from report_examples import BOUNCE, cell, column, complete, example, table
 
 from irlcli.data.descriptions import LearnedReward
@@ -134,3 +135,12 @@ def test_the_budget_of_retraining_from_the_student_is_listed():
     assert column(more, "from the student") == ["400", "400"]
     assert column(plain, "from the student") == ["-", "-"]
     assert column(plain, "transfer steps") == column(more, "transfer steps") == ["3,000", "3,000"]
+
+
+def test_a_budget_that_training_may_leave_unused_is_an_upper_limit():
+    p, points = example(complete())
+    first, second = p.rows
+    early = first.config | {"airl": first.config["airl"] | {"plateau_rounds": 10}}
+    p = replace(p, rows=(replace(first, config=early), second))
+    shown = table(build(p, points, {}, {}), "Budgets")
+    assert column(shown, "AIRL steps") == ["at most 2,000", "2,000"]
