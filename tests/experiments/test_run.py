@@ -235,13 +235,16 @@ def test_a_damaged_copy_elsewhere_is_computed_instead(irl, store_copy, tmp_path)
 def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs, tmp_path):
     ids, _ = uninterrupted
     store = tmp_path / "runs"
-    for count, slow in ((1, "0.3"), (2, "60")):
+    for count, slow in ((1, "2"), (2, "60")):
         begin = len(runs.lines())
         process = runs.start(store, *REWARDS, "--jobs", "2", IRL_TEST_ROUND=slow)
-        while not any("computes" in line for line in runs.lines()[begin:]):
+        # The second run finds the checkpoint of the first.
+        while not (
+            any("computes" in line for line in runs.lines()[begin:])
+            and list(store.glob(".work/*/checkpoint"))
+        ):
             assert process.poll() is None
             time.sleep(0.01)
-        time.sleep(0.5)
         for _ in range(count):
             process.send_signal(signal.SIGINT)
             time.sleep(0.3)
