@@ -101,9 +101,8 @@ def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_p
     """SIGUSR2 is what Slurm sends before a time limit, SIGTERM what it sends before a preemption."""
     store = tmp_path / "runs"
     line = (store, "--cluster", "local", "--jobs", "3", "--until", "experts")
-    process = runs.start(*line, IRL_TEST_ROUND="0.5")
+    process = runs.start(*line, IRL_TEST_ROUND="1")
     runs.wait_for(lambda line: "computes" in line, process)
-    time.sleep(1.0)
     warned = [line["pid"] for line in runs.lines() if "computes" in line]
     for number in (signal.SIGUSR2, signal.SIGTERM):
         # From Slurm itself, and passed on by the job.

@@ -168,16 +168,16 @@ def test_of_many_processes_one_takes_a_stale_claim_over(empty_store, claims):
     """Without locks, so that the claim alone decides."""
     foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS + 1)
     code = (
-        "import fcntl, sys, time, errno\n"
+        "import fcntl, sys, errno\n"
         "def flock(*_): raise OSError(errno.ENOLCK, '')\n"
         "fcntl.flock = flock\n"
         "from irlcli.errors import Busy\n"
         "from irlcli.store import Store\n"
-        "sys.stdin.readline()\n"
+        "print('ready', flush=True); sys.stdin.readline()\n"
         "try:\n"
         f"    with Store({str(empty_store.root)!r}).working_on({KEY!r}, wait=False):\n"
-        "        print('mine', flush=True); time.sleep(2)\n"
-        "except Busy: print('busy')\n"
+        "        print('mine', flush=True); sys.stdin.read()\n"
+        "except Busy: print('busy', flush=True)\n"
     )
     children = [
         subprocess.Popen(
@@ -188,9 +188,11 @@ def test_of_many_processes_one_takes_a_stale_claim_over(empty_store, claims):
         )
         for _ in range(6)
     ]
-    time.sleep(1.5)
+    assert [child.stdout.readline() for child in children] == ["ready\n"] * 6
     for child in children:
         child.stdin.write("\n")
         child.stdin.flush()
-    said = [child.communicate()[0].strip() for child in children]
+    said = [child.stdout.readline().strip() for child in children]
+    for child in children:
+        child.communicate()  # which closes its stdin
     assert sorted(said) == ["busy"] * 5 + ["mine"]
