@@ -1,6 +1,6 @@
 """``irl assess``."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -8,17 +8,9 @@ from irlcli.cli import console as out
 from irlcli.cli.options import Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured
-from irlcli.envs.registry import environment
-from irlcli.errors import UsageError
-from irlcli.experiments import bank, references
-from irlcli.interventions import parse_setting
-from irlcli.requests import arguments
-from irlcli.stages import assess as stage
-from irlcli.stages.train_airl import reward_label
+from irlcli.experiments import references
+from irlcli.requests import assess as requested
 from irlcli.store import Artefact
-
-if TYPE_CHECKING:
-    from irlcli.stages.base import Source
 
 
 @stage_command
@@ -43,43 +35,15 @@ def assess(
     name: Name = None,
 ) -> None:
     """Measure how well a learned reward ranks policies of mixed quality."""
-    if ood is not None and intervention is not None:
-        raise UsageError("--ood and --intervention both name settings", "give one of them")
-    known = arguments.env_name(env)
-    source, origin = references.tensor_file(session.store, reward, "reward")
-    arguments.check_env(reward, origin.env, known)
-    env = origin.env
-    config = session.config(env, {"evaluation.episodes": episodes})
-    if ood is not None:
-        settings = arguments.named_settings(env, config, ood, "ood", origin)
-    elif intervention is not None:
-        settings = arguments.named_settings(env, config, intervention, "id", origin)
-    else:
-        settings = [parse_setting(env, text) for text in origin.settings]
-    finder = bank.Finder(session.store, session.runner().lookup(), config)
-    shown, cloned = finder.demonstrations(source), origin.settings
-    if demos is not None:
-        shown, cloned = _given(session, demos, env)
-    policies = finder.policies(source, origin, settings, shown, cloned, seed)
-    if shown is None:
-        session.console.warn(
-            "no ladder of noise: the store does not hold what this reward was learned from; "
-            "name demonstrations with --demos"
-        )
-    own = environment(env).own
-    named = env if own is None else own.source
-    missing = [str(s) for s in settings if str(s) not in policies.experts]
-    for text in missing:
-        session.console.warn(
-            f"no expert of {text} with this config, so no regret and no expert minus idle: "
-            f"`{session.suggestion('evaluate', '--expert', '--env', named, '--setting', text)}` "
-            "trains it"
-        )
-    request = stage.request(
-        source,
-        env,
-        bank.bank(env, settings, config, policies, seed),
-        reward_label(origin.airl, origin.seed),
+    request, retrain = requested.assess(
+        session,
+        reward=reward,
+        ood=ood,
+        intervention=intervention,
+        demos=demos,
+        episodes=episodes,
+        env=env,
+        seed=seed,
     )
 
     def found(artefact: Artefact) -> Assessment:
@@ -92,20 +56,11 @@ def assess(
     )
     if artefacts and not session.as_json:
         print_assessment(found(artefacts[0]))
-        if not any(policies.retrained.values()):
-            line = session.suggestion("transfer", "--reward", reward, "--setting", str(settings[0]))
-            places = ", ".join(map(str, settings))
-            out.print_note(f"No policy was retrained on this reward in {places}: `{line}` does it")
-
-
-def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[str, ...]]":
-    source, of, settings = references.demonstrations(session.store, demos)
-    if of != env:
-        raise UsageError(
-            f"{demos!r} are demonstrations of {of}, not of {env}",
-            "name demonstrations of the reward's environment",
-        )
-    return source, tuple(settings)
+        if retrain is not None:
+            places = ", ".join(dict.fromkeys(entry.setting for entry in request.parameters.bank))
+            out.print_note(
+                f"No policy was retrained on this reward in {places}: `{retrain}` does it"
+            )
 
 
 def print_assessment(assessment: Assessment) -> None:

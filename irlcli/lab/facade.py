@@ -21,6 +21,7 @@ from irlcli.lab.arguments import (
 )
 from irlcli.lab.display import console
 from irlcli.lab.stored import Evaluations, PlannedTable, Stored
+from irlcli.requests import assess as assessment
 from irlcli.requests import collect, train
 from irlcli.requests import evaluate as evaluation
 from irlcli.requests import tables as planning
@@ -342,6 +343,44 @@ class Lab:
         with self._at_work(configs, words("evaluate", options)) as session:
             requests = evaluation.evaluate(session, **options, name=name)
             return Evaluations([Stored(session, a) for a in session.run(requests, name)])
+
+    @plainly
+    def assess(
+        self,
+        reward: Ref,
+        ood: str | Sequence[str] | None = None,
+        *,
+        intervention: str | Sequence[str] | None = None,
+        demos: Ref | None = None,
+        env: str | Path | None = None,
+        episodes: int | None = None,
+        seed: int = 0,
+        name: str | None = None,
+        **configs: Unpack[Configs],
+    ) -> Stored:
+        """Measure how well a learned reward ranks policies of mixed quality.
+
+        Args:
+            reward: a learned reward.
+            ood, intervention: settings; by default those the reward was learned in.
+            demos: demonstrations for the ladder of noise; by default the reward's own.
+            env: TOML file of the environment, for a reward outside the store.
+            episodes: of each policy.
+            seed: of the episodes.
+            name: to give the artefact.
+            configs: ``profile``, ``settings`` and ``set`` of this call.
+        """
+        options: dict[str, Any] = {
+            "ood": joined(ood),
+            "intervention": joined(intervention),
+            "demos": None if demos is None else self._ref(demos),
+            "env": None if env is None else str(env),
+            "episodes": None if episodes is None else whole("episodes", episodes, 1),
+            "seed": whole("seed", seed),
+        }
+        ref = self._ref(reward)
+        with self._at_work(configs, words("assess", options, ref)) as session:
+            return self._run(session, assessment.assess(session, reward=ref, **options)[0], name)
 
     @plainly
     def plan(

@@ -59,8 +59,8 @@ class Stored:
         """The table that the stage leaves, or another one of its ``.parquet`` outputs.
 
         A row per setting of demonstrations (``summary.json``) and of a MaxEnt reward
-        (``quality.json``), per agent and setting of an evaluation, and per round and setting of any
-        other training (``metrics.parquet``).
+        (``quality.json``), per agent and setting of an evaluation, per policy and setting of an
+        assessment, and per round and setting of any other training (``metrics.parquet``).
 
         Raises:
             UsageError: it leaves none, or ``output`` is not in Parquet.
@@ -71,6 +71,8 @@ class Stored:
 
         if output is None and self.stage == "evaluate":
             return pd.DataFrame(as_json([measured(self._session, self._artefact)]))
+        if output is None and self.stage == "assess":
+            return pd.DataFrame(_bank(read_json(self.output("assessment.json"))))
         names = [output.path for output in self._artefact.manifest.outputs]
         if output is None:
             output = next((name for name in _TABLES if name in names), "")
@@ -83,6 +85,29 @@ class Stored:
             f"{self.id} ({self.stage}) has no table {output}".rstrip(),
             f"its outputs: {', '.join(names)}; .output(NAME) is the path of one",
         )
+
+
+def _bank(assessment: dict[str, Any]) -> list[dict[str, Any]]:
+    """Mean returns of each policy in each setting, with standard errors, and the verdict on it."""
+    verdicts = {
+        (assessed["setting"], split["policy"]): split["verdict"]
+        for assessed in assessment["settings"]
+        for split in assessed["retrained"]
+    }
+    return [
+        {
+            "setting": entry["setting"],
+            "policy": entry["policy"],
+            "kind": entry["kind"],
+            "true": entry["true"]["mean"],
+            "true_error": entry["true"]["error"],
+            "learned": entry["learned"]["mean"],
+            "learned_error": entry["learned"]["error"],
+            "progress": entry["progress"],
+            "verdict": verdicts.get((entry["setting"], entry["policy"])),
+        }
+        for entry in assessment["bank"]
+    ]
 
 
 class Evaluations(Sequence[Stored]):

@@ -1,6 +1,7 @@
 """irlcli.Lab: the command line's artefacts from Python, its errors, and interruption."""
 
 import inspect
+import json
 import re
 import signal
 import subprocess
@@ -69,6 +70,7 @@ COMMANDS = {
     "train-maxent": irlcli.Lab.train_maxent,
     "transfer": irlcli.Lab.transfer,
     "evaluate": irlcli.Lab.evaluate,
+    "assess": irlcli.Lab.assess,
     "plan": irlcli.Lab.plan,
 }
 
@@ -99,6 +101,22 @@ def test_tables_are_data_frames(lab, irl, store_copy):
     ]
     with pytest.raises(UsageError, match="2 evaluations"):
         _ = experts.id
+
+
+def test_an_assessment_is_the_commands_and_a_table_of_its_bank(lab, irl):
+    # Without the setting's expert there is no verdict.
+    lab.evaluate(expert=True, env="lunar-lander", ood="engine-power=1.5x", episodes=1)
+    made = lab.assess("airl", ood="1.5x", name="assessed")
+    table = made.to_pandas().set_index("policy")
+    document = json.loads(made.output("assessment.json").read_text())
+    true = {entry["policy"]: entry["true"]["mean"] for entry in document["bank"]}
+    assert table["true"].to_dict() == true and set(table["setting"]) == {"engine-power=1.5x"}
+    judged = table["verdict"].dropna().to_dict()
+    (setting,) = document["settings"]
+    assert judged == {split["policy"]: split["verdict"] for split in setting["retrained"]} != {}
+    record = Store(lab.store).get(made.id).provenance()
+    done = irl(*record["command"][1:], "--json")
+    assert json.loads(done.out)["id"] == made.id and "HIT assess" in done.err
 
 
 def test_settings_may_be_lists(lab):

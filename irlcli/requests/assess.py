@@ -1,0 +1,104 @@
+"""``assess``: how well a learned reward ranks policies of mixed quality."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from irlcli.envs.registry import environment
+from irlcli.errors import UsageError
+from irlcli.experiments import bank, references
+from irlcli.interventions import Setting, parse_setting
+from irlcli.requests import arguments
+from irlcli.requests.session import StageSession
+from irlcli.stages import assess as stage
+from irlcli.stages.base import Request
+from irlcli.stages.train_airl import reward_label
+
+if TYPE_CHECKING:
+    from irlcli.stages.base import Source
+
+
+class Assessing(NamedTuple):
+    """An assessment.
+
+    ``retrain`` is the command line that retrains a policy on the reward; None if its bank has one.
+    """
+
+    request: Request
+    retrain: str | None
+
+
+def assess(
+    session: StageSession,
+    *,
+    reward: str,
+    ood: str | None,
+    intervention: str | None,
+    demos: str | None,
+    episodes: int | None,
+    env: str | None,
+    seed: int,
+) -> Assessing:
+    """An assessment of ``reward`` on the policies that the store holds, and on new ones.
+
+    Warns if it lacks demonstrations or experts.
+
+    Raises:
+        UsageError: contradictory or unsuitable options.
+        NotFound: no such reward or demonstrations.
+    """
+    if ood is not None and intervention is not None:
+        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    known = arguments.env_name(env)
+    source, origin = references.tensor_file(session.store, reward, "reward")
+    arguments.check_env(reward, origin.env, known)
+    config = session.config(origin.env, {"evaluation.episodes": episodes})
+    settings: Sequence[Setting] = [parse_setting(origin.env, text) for text in origin.settings]
+    if ood is not None:
+        settings = arguments.named_settings(origin.env, config, ood, "ood", origin)
+    elif intervention is not None:
+        settings = arguments.named_settings(origin.env, config, intervention, "id", origin)
+    finder = bank.Finder(session.store, session.runner().lookup(), config)
+    shown, cloned = finder.demonstrations(source), origin.settings
+    if demos is not None:
+        shown, cloned = _given(session, demos, origin.env)
+    policies = finder.policies(source, origin, settings, shown, cloned, seed)
+    if shown is None:
+        session.console.warn(
+            "no ladder of noise: the store does not hold what this reward was learned from; "
+            "name demonstrations with --demos"
+        )
+    _warn_of_missing_experts(session, origin.env, settings, policies)
+    request = stage.request(
+        source,
+        origin.env,
+        bank.bank(origin.env, settings, config, policies, seed),
+        reward_label(origin.airl, origin.seed),
+    )
+    retrain = None
+    if not any(policies.retrained.values()):
+        retrain = session.suggestion("transfer", "--reward", reward, "--setting", str(settings[0]))
+    return Assessing(request, retrain)
+
+
+def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[str, ...]]":
+    source, of, settings = references.demonstrations(session.store, demos)
+    if of != env:
+        raise UsageError(
+            f"{demos!r} are demonstrations of {of}, not of {env}",
+            "name demonstrations of the reward's environment",
+        )
+    return source, tuple(settings)
+
+
+def _warn_of_missing_experts(
+    session: StageSession, env: str, settings: Sequence[Setting], policies: bank.Policies
+) -> None:
+    own = environment(env).own
+    named = env if own is None else own.source
+    for setting in map(str, settings):
+        if setting not in policies.experts:
+            line = session.suggestion("evaluate", "--expert", "--env", named, "--setting", setting)
+            session.console.warn(
+                f"no expert of {setting} with this config, so no regret and no expert minus idle: "
+                f"`{line}` trains it"
+            )
