@@ -138,7 +138,7 @@ def name(
 ) -> None:
     """Name an artefact, which also protects it from gc."""
     artefact = session.artefact(ref)
-    session.name(name, artefact)
+    session.store.set_name(name, artefact)
     if session.as_json:
         out.print_json("name", {"name": name, "id": artefact.id})
     else:

@@ -268,7 +268,7 @@ def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str)
                 artefact = runner.run(found.tasks[name].request)
                 # A choice of lambda decides what the next requests are.
                 found.refresh()
-            runner.name(name, artefact)
+            runner.store.set_name(name, artefact)
             if name == only:
                 session.print_artefact(artefact, only)
     finally:
@@ -327,7 +327,7 @@ def _report(
     finally:
         session.console.close()
     name = choice.report_name(found.selection.tag)
-    runner.name(name, artefact)
+    runner.store.set_name(name, artefact)
     if directory is not None:
         copy_outputs(session, artefact, directory)
     session.print_artefact(artefact, name)

@@ -237,7 +237,7 @@ class _Execution:
         self._done.add(name)
         artefact: Artefact | None = self._plan.step(name).artefact
         if artefact is not None:
-            self._runner.name(name, artefact)
+            self._runner.store.set_name(name, artefact)
 
     def _show_lines(self) -> None:
         """Pass on what the processes wrote; wait a moment if they wrote nothing."""

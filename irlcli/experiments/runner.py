@@ -167,12 +167,6 @@ class Runner:
             return artefact
         return None
 
-    def name(self, name: str, artefact: Artefact) -> None:
-        """Let ``name`` stand for ``artefact``, and warn if another one loses it: gc may take that."""
-        before = self.store.set_name(name, artefact)
-        if before is not None:
-            self.console.warn(f"{name} no longer names {before}")
-
     def _run(self, request: Request, done: dict[str, Artefact]) -> Artefact:
         """``done`` are the artefacts of this run by key: each is made or announced once."""
         sources: dict[str, Source] = {}

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from irlcli.errors import RETRY, NotFound, StageFailed, UsageError
+from irlcli.errors import NotFound, UsageError
 from irlcli.store import DEFAULT_ROOT, Artefact, Store
 
 DEFAULT_STORE, DEFAULT_PROFILE = Path(DEFAULT_ROOT), "standard"
@@ -78,17 +78,6 @@ class Session:
                 f"`{shlex.join(['irl', 'ls', *self.store.option])}` lists the artefacts",
             )
         return resolved.artefact
-
-    def name(self, name: str, artefact: Artefact) -> None:
-        """Give ``artefact`` the name, and warn if another one loses it: gc may now delete that."""
-        try:
-            before = self.store.set_name(name, artefact)
-        except OSError as error:
-            raise StageFailed(
-                f"the store {self.store.root} cannot be written: {error.strerror or error}", RETRY
-            ) from None
-        if before is not None:
-            self.console.warn(f"{name} no longer names {before}")
 
 
 class StageSession(Session):
@@ -196,7 +185,7 @@ class StageSession(Session):
             finally:
                 self.console.close()
             if name is not None:
-                self.name(name, artefacts[0])
+                self.store.set_name(name, artefacts[0])
         return artefacts
 
     def prepare(self, request: "Request", then: str) -> Artefact | None:

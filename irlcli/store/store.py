@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import RETRY, IntegrityError, StageFailed, UsageError
 from irlcli.store import layout as layouts
 from irlcli.store import read, references
 from irlcli.store.artefact import Artefact, Published
@@ -142,9 +142,21 @@ class Store:
         """Refuse an invalid name: see :func:`irlcli.store.references.check_name`."""
         references.check_name(name)
 
-    def set_name(self, name: str, artefact: Artefact) -> str | None:
-        """Name an artefact: see :func:`irlcli.store.references.set_name`."""
-        return references.set_name(self._writable, name, artefact)
+    def set_name(self, name: str, artefact: Artefact) -> None:
+        """Name an artefact, and warn if another one loses the name: gc may now delete that.
+
+        Raises:
+            UsageError: as :func:`irlcli.store.references.check_name`.
+            StageFailed: the store cannot be written.
+        """
+        try:
+            before = references.set_name(self._writable, name, artefact)
+        except OSError as error:
+            raise StageFailed(
+                f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
+            ) from None
+        if before is not None:
+            self.warn(f"{name} no longer names {before}")
 
     # Working
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from pathlib import Path
 
 import pytest
@@ -291,8 +292,11 @@ def test_naming_again_leaves_the_file_alone(empty_store, artefact, publish):
     empty_store.set_name("best", artefact)
     assert path.stat().st_mtime == 1
     other = publish(empty_store, parameters={"seed": 1}).artefact
-    assert empty_store.set_name("best", artefact) is None
-    assert empty_store.set_name("best", other) == artefact.id
+    with warnings.catch_warnings(record=True) as caught:
+        empty_store.set_name("best", artefact)
+        assert not caught
+        empty_store.set_name("best", other)
+    assert [str(w.message) for w in caught] == [f"best no longer names {artefact.id}"]
     assert path.stat().st_mtime > 1
     assert empty_store.names() == {"best": other.id}
 

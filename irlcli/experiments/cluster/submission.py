@@ -193,7 +193,7 @@ class Submission:
             elif step.status == "HIT":
                 self._outcome.existed.append(name)
             if step.status == "HIT" and step.artefact is not None:
-                self._runner.name(name, step.artefact)
+                self._runner.store.set_name(name, step.artefact)
 
     def _exists(self, name: str) -> bool:
         return self._plan.step(name).status == "HIT"
@@ -247,7 +247,7 @@ class Submission:
         """Whether it is clear what became of a step whose job has left the queue."""
         step = self._plan.step(name)
         if step.status == "HIT" and step.artefact is not None:
-            self._runner.name(name, step.artefact)
+            self._runner.store.set_name(name, step.artefact)
             self._outcome.made.append(name)
             if self._plan.tasks[name].request.stage == choose_penalty.STAGE:
                 self._plan.refresh()
