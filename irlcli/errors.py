@@ -118,6 +118,8 @@ def of_types(message: str) -> str:
         " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
         for kinds in found.groups()
     )
+    if found.groups() == ("int", "float"):
+        got = "one with a point or an exponent"
     return f"expected {expected}, found {got}"
 
 

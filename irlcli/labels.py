@@ -4,6 +4,7 @@ They come from parameters as they are stored. These may have been written by han
 assumed.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,9 +14,6 @@ from irlcli.store import KeyRecord
 _MAX_LENGTH = 200
 # Section and field of a stage's parameters, and what they count.
 _BUDGETS = (
-    ("airl", "total_steps", "steps"),
-    ("transfer", "total_steps", "steps"),
-    ("", "total_steps", "steps"),
     ("maxent", "iterations", "iterations"),
     ("clone", "epochs", "epochs"),
     ("evaluation", "episodes", "episodes"),
@@ -65,6 +63,10 @@ def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
 
 def budget(parameters: Mapping[str, Any]) -> str:
     """How long a stage trains or how much it measures, in which profiles differ; else empty."""
+    for config in (parameters.get("airl"), parameters.get("transfer"), parameters):
+        if isinstance(config, dict) and isinstance(config.get("total_steps"), int):
+            restarts = config.get("restarts")
+            return f"{steps(config) * (restarts if isinstance(restarts, int) else 1):,} steps"
     for section, field, unit in _BUDGETS:
         config = parameters.get(section) if section else parameters
         found = config.get(field) if isinstance(config, dict) else None
@@ -72,11 +74,21 @@ def budget(parameters: Mapping[str, Any]) -> str:
             continue
         counts = found if isinstance(found, list | tuple) else [found]
         if counts and all(isinstance(count, int) for count in counts):
-            restarts = config.get("restarts") if isinstance(config, dict) else None
-            if isinstance(restarts, int):
-                counts = [count * restarts for count in counts]
             return _joined([", ".join(f"{count:,}" for count in counts), unit])
     return ""
+
+
+def steps(config: Mapping[str, Any], budget: int | None = None) -> int:
+    """Environment steps of a training with ``config``: its budget, rounded up to whole rounds."""
+    total: int = config["total_steps"] if budget is None else budget
+    trainer = config.get("sac" if config.get("algorithm") == "sac" else "ppo")
+    if not isinstance(trainer, dict):
+        return total
+    sizes = [trainer.get("n_envs"), trainer.get("n_steps"), trainer.get("rollouts_per_round", 1)]
+    if not all(isinstance(size, int) and size > 0 for size in sizes):
+        return total
+    size = math.prod(sizes)
+    return -(-total // size) * size
 
 
 def learned(config: Mapping[str, Any]) -> str:

@@ -59,7 +59,7 @@ class LearnedReward:
                 terminate: pass False for it.
 
         Raises:
-            ValueError: arrays of other shapes.
+            ValueError: arrays of other shapes, or indices of no action.
         """
         from irlcli.trajectories import Transitions
 
@@ -85,6 +85,11 @@ class LearnedReward:
         for name, (array, shape) in wanted.items():
             if array.shape != shape:
                 raise ValueError(f"{name} is {list(array.shape)}, not {list(shape)}")
+        if self.discrete:
+            counts = np.array(self.choices or self.action_size)
+            if ((data.actions < 0) | (data.actions >= counts)).any():
+                last = ", ".join(map(str, np.ravel(counts - 1)))
+                raise ValueError(f"act has indices below 0 or above {last}")
         return self._frozen.of_steps(data)
 
     def module(self) -> StandaloneReward:

@@ -276,6 +276,10 @@ def test_discrete_actions_work_too(tmp_path):
         ),
     ):
         DQN("MlpPolicy", env, learning_starts=10, policy_kwargs={"net_arch": [8]}).learn(30)
+    still = np.zeros((1, 8), dtype=np.float32)
+    for index in (-1, 4):
+        with pytest.raises(ValueError, match="act has indices below 0 or above 3"):
+            reward(still, [index], still, [False])
 
 
 # The file

@@ -84,12 +84,14 @@ def print_assessment(assessment: Assessment) -> None:
     out.print_table(columns, [_ranked(s) for s in every], stderr=True)
     if assessment.epic_missing:
         out.print_note(f"no EPIC distance: {assessment.epic_missing}")
+    weak = set[str]()
     for s in assessment.settings:
         mean = {e.kind: e.true.mean for e in assessment.bank if e.setting == s.setting}
         if s.retrained and mean["expert"] <= mean["random"]:
+            weak.add(s.setting)
             out.print_note(
-                f"{s.setting}: the expert earns no more than the random agent, so that the verdicts "
-                "mean nothing"
+                f"{s.setting}: the expert earns no more than the random agent, so there is no "
+                "verdict"
             )
     splits: list[list[Any]] = [
         [
@@ -97,7 +99,7 @@ def print_assessment(assessment: Assessment) -> None:
             r.policy,
             _measured(r.true_regret),
             _measured(r.learned_gap),
-            r.verdict + ("" if r.clear else ", uncertain"),
+            "-" if s.setting in weak else r.verdict + ("" if r.clear else ", uncertain"),
             "-" if r.ceiling is None else f"{r.ceiling:g}",
         ]
         for s in assessment.settings

@@ -60,7 +60,8 @@ def verify(
         raise _with_details(
             IntegrityError(
                 f"{len(damaged)} of {checked} artefacts {state}: {', '.join(damaged)}",
-                "run the commands above again to recompute them",
+                "run the commands above again to recompute them; with `--from STORE` they copy what "
+                "another store holds",
             ),
             result,
         )

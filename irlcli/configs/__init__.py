@@ -1,6 +1,6 @@
 """Hyperparameters: their schema, which of them matter, and how they are loaded."""
 
-from irlcli.configs.load import PROFILES, check_profile, load_config
+from irlcli.configs.load import PROFILES, check_profile, lacks_profile, load_config
 from irlcli.configs.schema import (
     AIRLConfig,
     AssessmentConfig,
@@ -45,5 +45,6 @@ __all__ = [
     "SACConfig",
     "TransferConfig",
     "check_profile",
+    "lacks_profile",
     "load_config",
 ]

@@ -90,6 +90,17 @@ def load_config(
     return _stack(env, layers)
 
 
+def lacks_profile(env: str, profile: str) -> str:
+    """The TOML file of an environment of one's own that has no section for ``profile``; else empty.
+
+    The values in ``settings/`` that ``standard`` stands for are those without a profile.
+    """
+    own = None if env == CONTROL else environment(env).own
+    if own is None or profile == "standard" or profile in own.settings.get("profiles", {}):
+        return ""
+    return own.source
+
+
 def unseen_settings(env: str, config: Config) -> list[Setting]:
     """Every OOD setting that the settings file lists."""
     return [

@@ -57,7 +57,7 @@ def write_stream(
     stream = pieces(parts, size)
     first = next(stream, None)
     if first is None:
-        raise UsageError("there is no episode to write", "name a source that holds episodes")
+        raise UsageError("the recordings hold no episode", "name recordings with episodes")
     width, rewarded = first.observations.shape[1], first.rewards is not None
     schema = steps_schema(width, action_type(first.actions), rewarded)
     tags = file_metadata(env, metadata, schema)

@@ -302,13 +302,13 @@ def check_code(spec: EnvironmentSpec) -> None:
             f"{own.source}: {module} changed since the file was read", "run the same command again"
         )
     raise UsageError(
-        f"{own.source}: it was made with {module} {_described(own.code)}, here is "
-        f"{_described(now)}",
-        "name the environment's file with --env to go on with what is here",
+        f"the code of {module} is not what {own.source} was made with: that was {_described(own.code)}, "
+        f"this is {_described(now)}",
+        "name the environment's file with --env to use it as it is now",
     )
 
 
 def _described(code: Code) -> str:
     version = "" if code.version is None else f"{code.distribution} {code.version}"
-    content = "" if code.sha256 is None else f"of content {code.sha256[:12]}"
+    content = "" if code.sha256 is None else f"sha256 {code.sha256[:12]}"
     return " ".join(part for part in (version, content) if part)

@@ -59,8 +59,8 @@ def tensor_file(
     introduce(artefact)
     if artefact.manifest.record.stage == "train-maxent":
         raise UsageError(
-            f"{ref!r} is a tabular-reward, not a {kind}",
-            "no policy is trained on it; its quality.json rates it",
+            f"{ref!r} is a reward of MaxEnt IRL, a table over the cells of a gridworld",
+            f"name a {kind} of `irl train-airl`; the quality.json of this one rates it",
         )
     if artefact.manifest.record.stage == "clone" and kind == "reward":
         raise UsageError(
@@ -170,10 +170,12 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
         from irlcli.data.demonstrations import EPISODES, STEPS, read_demonstrations
 
         if not any((Path(ref) / name).exists() for name in (EPISODES, STEPS)):
-            raise NotFound(
-                f"{ref!r} is neither an artefact nor a directory with {EPISODES}",
-                "name an artefact, or a directory of demonstrations; `irl ls` lists the artefacts",
+            hint = (
+                "name an artefact, or a directory of demonstrations; `irl ls` lists the artefacts"
             )
+            if Path(ref).is_file():
+                hint = f"`irl import {ref}` makes demonstrations of a recording"
+            raise NotFound(f"{ref!r} is neither an artefact nor a directory with {EPISODES}", hint)
         demos = read_demonstrations(Path(ref))
         return source_of(resolved), demos.env, list(demos.trajectories)
     introduce(artefact)
@@ -222,6 +224,10 @@ def _recorded(text: str) -> Source:
     source = source_of(Resolved(None, path))
     if path.is_file() and not _is_parquet(path):
         raise UsageError(f"{path} is not a Parquet file", hint)
+    from irlcli.data.exchange.imitation import STATE
+
+    if _form(text) == "imitation" and not (path / STATE).is_file():
+        raise UsageError(f"{path} holds no trajectories of imitation: no {STATE}", hint)
     return source
 
 

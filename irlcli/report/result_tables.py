@@ -9,6 +9,7 @@ import pandas as pd
 from scipy.stats import ttest_ind_from_stats
 
 from irlcli.data.descriptions import Verdict
+from irlcli.labels import steps
 from irlcli.report import paper
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
 from irlcli.report.compute import failed_to_imitate
@@ -80,7 +81,7 @@ _CELL_NOTE = (
     "experts are one policy per training setting."
 )
 _BUDGET_NOTE = (
-    "Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
+    "Steps: the budget in whole rounds. Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
     "where the table has its own, by method and seed where it was chosen by leaving a setting out. Round: the one that was kept. "
     "At most: training could end earlier by airl.plateau_rounds; `stopped_after` in reward.json is the round."
 )
@@ -342,13 +343,14 @@ def budgets(p: Parameters) -> Table:
     lines = []
     for row in p.rows:
         config = row.config
+        transfer = config["transfer"]
         lines.append(
             [
                 row.name,
-                f"{config['expert']['total_steps']:,}",
+                f"{steps(config['expert']):,}",
                 ", ".join(map(str, row.demonstrations)),
                 ("at most " if config["airl"].get("plateau_rounds") else "")
-                + f"{config['airl']['total_steps']:,}",
+                + f"{steps(config['airl']):,}",
                 ", ".join(
                     [
                         f"{config['airl']['penalty_weight']:g}",
@@ -356,10 +358,10 @@ def budgets(p: Parameters) -> Table:
                     ]
                 ),
                 config["airl"]["select"],
-                f"{config['transfer']['total_steps'] * config['transfer'].get('restarts', 1):,}"
+                f"{steps(transfer) * transfer.get('restarts', 1):,}"
                 if {"transfer", "transfer-id"} & set(p.measures)
                 else "-",
-                f"{config['transfer']['from_student']['total_steps']:,}"
+                f"{steps(transfer, transfer['from_student']['total_steps']):,}"
                 if "from-student" in p.measures
                 else "-",
                 str(config["evaluation"]["episodes"]),

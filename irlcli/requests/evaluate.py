@@ -141,7 +141,7 @@ def _of_policy(
     if where.given:
         settings = where.settings(origin.env, config, origin)
         # A retrained policy was trained where its reward was not.
-        if where.kind == "ood" and origin.agent == "student":
+        if where.kind == "ood" and origin.agent != "transfer":
             arguments.warn_of_seen(session.console, settings, origin, policy)
     else:
         settings = [parse_setting(origin.env, text) for text in origin.settings]

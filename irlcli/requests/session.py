@@ -119,13 +119,20 @@ class StageSession(Session):
         self.sources = list(sources)
         self.command = list(command)
         self.workers = workers
+        self._warned: set[str] = set()
 
     def config(
         self, env: str, flags: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
     ) -> "Config":
         """The config of ``env`` under this session's profile and overrides, then ``overrides``."""
-        from irlcli.configs import load_config
+        from irlcli.configs import lacks_profile, load_config
 
+        source = lacks_profile(env, self.profile)
+        if source and source not in self._warned:
+            self._warned.add(source)
+            self.console.warn(
+                f"{source} has no [profiles.{self.profile}]: its values for --profile standard are used"
+            )
         file = self.file or self.table_file
         return load_config(env, self.profile, file, [*self.overrides, *overrides], flags)
 

@@ -122,7 +122,7 @@ def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[s
 def recorded_command(directory: Path, layout: Layout) -> str:
     """The command line that made an artefact, to be repeated in the store ``layout``.
 
-    Empty if the provenance, which may be damaged, cannot be read.
+    Without ``--out``: its files lie beside the store, and may be another store's by now. Empty if the provenance, which may be damaged, cannot be read.
     """
     import shlex
 
@@ -133,8 +133,8 @@ def recorded_command(directory: Path, layout: Layout) -> str:
     words = iter(shlex.split(command))
     kept = []
     for word in words:
-        if word == "--store":
+        if word in ("--store", "--out"):
             next(words, None)
-        elif not word.startswith("--store="):
+        elif not word.startswith(("--store=", "--out=")):
             kept.append(word)
     return shlex.join([*kept, *layout.option])

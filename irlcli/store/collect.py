@@ -34,7 +34,10 @@ class Missing(NamedTuple):
     def text(self, id16: str) -> str:
         """One line about the artefact ``id16``."""
         reasons = [f"the name {name!r} points to it" for name in self.names]
-        reasons += [f"{', '.join(self.made)} was made from it"] if self.made else []
+        if self.made:
+            reasons += [
+                f"{', '.join(self.made)} {'was' if len(self.made) == 1 else 'were'} made from it"
+            ]
         where = f" (damaged, now in {self.place})" if self.place is not None else ""
         return f"{id16} is missing{where}: {'; '.join(reasons)}"
 

@@ -182,6 +182,7 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
         ([exported, exported, *LANDER, "--setting-column", "s"], 2, "is of one setting"),
         ([tmp_path / "nan.parquet", *LANDER], 2, f"row {len(table) - 1}: reward is not finite"),
         ([tmp_path / "text.parquet", *LANDER], 2, "text.parquet is not a Parquet file"),
+        ([tmp_path, *LANDER], 2, "holds no trajectories of imitation"),
         ([tmp_path / "cut.parquet", *LANDER], 4, "cut.parquet"),
         ([tmp_path / "none.parquet", *LANDER], 2, "no episode"),
         ([tmp_path / "nowhere.parquet", *LANDER], 3, "nowhere.parquet"),

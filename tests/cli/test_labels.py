@@ -67,6 +67,37 @@ def test_listings_tell_how_policies_were_retrained_and_for_how_long(irl, store_c
     assert len({text.splitlines()[0].partition(" ")[2] for text in own}) == 4
 
 
+@pytest.mark.parametrize(
+    ("parameters", "shown"),
+    [
+        ({"total_steps": 800, "ppo": {"n_envs": 8, "n_steps": 1024}}, "8,192 steps"),
+        (
+            {
+                "airl": {
+                    "total_steps": 9,
+                    "ppo": {"n_envs": 2, "n_steps": 2, "rollouts_per_round": 2},
+                }
+            },
+            "16 steps",
+        ),
+        (
+            {
+                "transfer": {
+                    "algorithm": "sac",
+                    "total_steps": 8,
+                    "restarts": 3,
+                    "sac": {"n_envs": 4, "n_steps": 2},
+                }
+            },
+            "24 steps",
+        ),
+        ({"total_steps": 800, "ppo": {"n_envs": "many", "n_steps": 0}}, "800 steps"),
+    ],
+)
+def test_listed_steps_are_whole_rounds(parameters, shown):
+    assert labels.budget(parameters) == shown
+
+
 def test_plans_tell_how_a_policy_is_retrained(irl, smoke_store):
     line = [*TRANSFER[:-2], *SMOKE, "--dry-run", "--store", smoke_store.path]
     ways = ([], ["--start", "student"], ["--set", "transfer.ceiling=0.9"])

@@ -94,7 +94,7 @@ def test_the_chain_needs_the_file_only_once(bench):
     # Other code is named, and refused unless the user names the file.
     bench.edit(bench.module, "0.1 * self.speed", "0.2 * self.speed")
     other = bench.irl(*again)
-    assert other.code == 2 and "cart of content" in other.err and "--env" in other.err
+    assert other.code == 2 and "the code of cart is not" in other.err and "--env" in other.err
     assert status(bench, *again, "--env", "cart.toml") == "RUN"
     # Nor is other code imported by a command that plans nothing.
     sys.modules.pop("cart", None)
@@ -103,6 +103,13 @@ def test_the_chain_needs_the_file_only_once(bench):
     played = bench.irl("play", "moved", "--out", "moved.gif")
     assert played.code == 2 and "--env" in played.err
     assert not (bench.directory / "mark").exists()
+
+
+def test_a_profile_that_the_file_does_not_have_is_named(bench):
+    line = ("collect-experts", "--env", "cart.toml", "--intervention", "mass", "--dry-run")
+    warned = [bench.irl(*line, "--profile", p).err for p in ("smoke", "standard", "paper")]
+    assert warned[0] == warned[1] == ""
+    assert warned[2].count("\n") == 1 and "cart.toml has no [profiles.paper]" in warned[2]
 
 
 def test_only_what_can_change_a_result_changes_the_key(bench):

@@ -178,9 +178,9 @@ def test_a_policy_retrained_on_the_reward_is_judged_where_the_expert_is_known(as
     assert split["true_regret"]["mean"] == pytest.approx(regret)
     assert split["learned_gap"]["mean"] == pytest.approx(gap)
     shown = irl(*line)
-    assert split["verdict"] in shown.err and "Spearman" in shown.err
     weak = best["true"]["mean"] <= means["random"]["true"]["mean"]
-    assert ("the verdicts mean nothing" in shown.err) == weak
+    assert (weak or split["verdict"] in shown.err) and "Spearman" in shown.err
+    assert ("there is no verdict" in shown.err) == weak
 
 
 def test_expert_minus_idle_counts_absorbing_steps(assessed):
@@ -309,4 +309,4 @@ def test_tabular_rewards_are_refused(irl, tmp_path):
     )
     irl("train-maxent", "--demos", "d", "--method", "erm", *common, "--name", "maxent")
     done = irl("assess", "maxent", *common)
-    assert done.code == 2 and "tabular-reward" in done.err and "hint:" in done.err
+    assert done.code == 2 and "MaxEnt IRL" in done.err and "hint:" in done.err

@@ -247,7 +247,7 @@ SIZE = ["--set", "gridworld.size=1024"]
         (["train-airl", "--demos", "demos"], "does not work on gridworld"),
         (["evaluate", "--random", "--env", "gridworld", "--intervention", "blocked=1"], "does not"),
         (["evaluate", "--expert", "--env", "gridworld", "--intervention", "blocked=1"], "does not"),
-        (["transfer", "--reward", "learned", "--ood", "blocked=1"], "is a tabular-reward"),
+        (["transfer", "--reward", "learned", "--ood", "blocked=1"], "is a reward of MaxEnt IRL"),
         (["report", "figure5"], "unknown report"),
         (["report", "figure2", "demos"], "no references"),
         (["report", "returns"], "name at least one evaluation"),

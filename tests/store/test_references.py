@@ -329,10 +329,12 @@ def test_the_name_of_a_quarantined_artefact_comes_with_the_command_that_made_it(
         ["--store", "elsewhere", "--seed", "1"],
         ["--seed", "1", "--store=elsewhere"],
         ["--seed", "1"],
+        ["--out", "shown", "--seed", "1"],
+        ["--seed", "1", "--out=shown"],
     ],
 )
 def test_a_copied_store_is_repaired_in_its_own_place(tmp_path, monkeypatch, publish, words):
-    """Not where the artefact was first made, which the recorded command names."""
+    """Not where the artefact was first made, which the recorded command names; nor beside a store."""
     monkeypatch.delenv("IRL_STORE", raising=False)
     copied = Layout(tmp_path / "copied")
     directory = publish(Store(copied.root)).artefact.directory

@@ -23,7 +23,7 @@ from irlcli.data.parquet import UNREADABLE
 from irlcli.data.steps import PIECE, Steps
 from irlcli.errors import IntegrityError, UsageError
 
-_STATE = "state.json"
+STATE = "state.json"
 _COLUMNS = ("obs", "acts", "terminal")
 _MAX_STATE_BYTES = 16 << 20
 
@@ -53,13 +53,13 @@ def read_imitation(directory: Path, expected: Expected, size: int = PIECE) -> It
 
 
 def _data_files(directory: Path) -> list[Path]:
-    path = directory / _STATE
+    path = directory / STATE
     if not path.is_file() or path.stat().st_size > _MAX_STATE_BYTES:
-        raise ValueError(f"it has no {_STATE}")
+        raise ValueError(f"it has no {STATE}")
     names = [entry["filename"] for entry in json.loads(path.read_bytes())["_data_files"]]
     for name in names:
         if not isinstance(name, str) or Path(name).name != name:
-            raise ValueError(f"{_STATE} names a file outside the directory")
+            raise ValueError(f"{STATE} names a file outside the directory")
     if not names or list(directory.glob("indices*.arrow")):
         raise ValueError("its rows are not stored in order: flatten_indices() it and save it again")
     return [directory / name for name in names]
