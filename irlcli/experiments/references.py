@@ -345,8 +345,13 @@ def output(
 def _only(artefact: Artefact, name: str) -> str:
     names = [o.path for o in artefact.manifest.outputs]
     if name not in names:
+        makers = {
+            "reward.pt": "`irl train-airl`",
+            "policy.pt": "`irl train-airl` or `irl transfer`",
+        }
+        wanted = f"name an artefact of {makers[name]}; " if name in makers else ""
         raise NotFound(
             f"artefact {artefact.id} ({artefact.manifest.record.stage}) holds no {name}",
-            f"it holds: {', '.join(names)}",
+            f"{wanted}this one holds: {', '.join(names)}",
         )
     return name
