@@ -82,7 +82,7 @@ def test_plans_and_listings_describe_rewards_alike():
 
 
 def test_profiles_show_in_the_budget():
-    assert labels.budget(transfer(total_steps=2048).parameters) == "2,048 steps"
+    assert labels.budget(transfer(total_steps=32_768).parameters) == "32,768 steps"
     assert labels.budget({"total_steps": 1_000_000, "ppo": {}}) == "1,000,000 steps"
     assert labels.budget({"evaluation": {"episodes": 20}}) == "20 episodes"
     assert labels.budget({"episodes": [10, 3]}) == "10, 3 episodes"

@@ -18,11 +18,19 @@ def main() -> None:
     75 busy, 130 interrupted. Errors are one line on stderr and a hint; with ``--json`` also a
     document on stdout; with ``--debug`` also a traceback.
     """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         _main()
     except KeyboardInterrupt:
         # A second Ctrl-C, while the first one was being handled.
         _fail(_interrupted())
+
+
+def _interrupt(_number: int, _frame: Any) -> None:
+    # A key that is held down must not interrupt the error message, nor what handles the interrupt.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def _main() -> None:
