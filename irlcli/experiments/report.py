@@ -82,7 +82,10 @@ def _experts(
         experts[f"{row.env} {row.knob}"] = config.expert if own is None else own
     parameters = report_experts.Parameters(
         command=command,
-        steps={name: expert.total_steps for name, expert in experts.items()},
+        steps={
+            name: expert.ppo.rounds(expert.total_steps) * expert.ppo.steps_per_round
+            for name, expert in experts.items()
+        },
         bars={name: expert.bar for name, expert in experts.items() if expert.bar is not None},
         cells=tuple(cells),
         runs=dict(runs),
