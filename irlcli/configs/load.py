@@ -93,7 +93,7 @@ def load_config(
 def lacks_profile(env: str, profile: str) -> str:
     """The TOML file of an environment of one's own that has no section for ``profile``; else empty.
 
-    The values in ``settings/`` that ``standard`` stands for are those without a profile.
+    ``standard``, the default, needs none.
     """
     own = None if env == CONTROL else environment(env).own
     if own is None or profile == "standard" or profile in own.settings.get("profiles", {}):

@@ -224,10 +224,11 @@ def _recorded(text: str) -> Source:
     source = source_of(Resolved(None, path))
     if path.is_file() and not _is_parquet(path):
         raise UsageError(f"{path} is not a Parquet file", hint)
-    from irlcli.data.exchange.imitation import STATE
+    if _form(text) == "imitation":
+        from irlcli.data.exchange.imitation import STATE
 
-    if _form(text) == "imitation" and not (path / STATE).is_file():
-        raise UsageError(f"{path} holds no trajectories of imitation: no {STATE}", hint)
+        if not (path / STATE).is_file():
+            raise UsageError(f"{path} holds no trajectories of imitation: no {STATE}", hint)
     return source
 
 

@@ -131,7 +131,7 @@ class StageSession(Session):
         if source and source not in self._warned:
             self._warned.add(source)
             self.console.warn(
-                f"{source} has no [profiles.{self.profile}]: its values for --profile standard are used"
+                f"{source} has no [profiles.{self.profile}]: its values outside [profiles] are used"
             )
         file = self.file or self.table_file
         return load_config(env, self.profile, file, [*self.overrides, *overrides], flags)
