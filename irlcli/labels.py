@@ -117,7 +117,8 @@ def learned(config: Mapping[str, Any]) -> str:
 def _challenged(challenger: Mapping[str, Any]) -> str | None:
     if not challenger.get("life"):
         return None
-    return "with mixed challengers" if challenger.get("mixed_share") else "with challengers"
+    mixed = "mixed " if challenger.get("mixed_share") else ""
+    return f"with {mixed}challengers" + (" per setting" if challenger.get("per_setting") else "")
 
 
 def retrained(

@@ -179,6 +179,22 @@ class Rollout:
         )
 
 
+def side_by_side(parts: Sequence[Rollout]) -> Rollout:
+    """The rollouts of equally many steps as one, the worlds of the first part first."""
+    arrays = {
+        f.name: np.concatenate([getattr(part, f.name) for part in parts], axis=1)
+        for f in fields(Rollout)
+        if f.name != "errors"
+    }
+    firsts = np.cumsum([0, *(part.terminated.shape[1] for part in parts)]).tolist()
+    errors = [
+        (first + world, error)
+        for first, part in zip(firsts, parts, strict=False)
+        for world, error in part.errors
+    ]
+    return Rollout(**arrays, errors=tuple(errors))
+
+
 def world_settings(worlds: int, settings: int) -> np.ndarray:
     """Index [worlds] of each world's setting: equal shares, setting-major."""
     return np.arange(worlds) * settings // worlds

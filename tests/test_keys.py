@@ -281,6 +281,7 @@ CHANGED = {
     "airl.averaged_rounds": 3,
     "airl.plateau_rounds": 3,
     "airl.challenger.mixed_share": 0.5,
+    "airl.challenger.per_setting": True,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
     "transfer.restarts": 3,

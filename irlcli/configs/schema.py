@@ -180,6 +180,8 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             that are kept, every round's with the same probability.
         mixed_share: of the challengers' samples, those whose numbers are mixed with an expert's;
             see :mod:`irlcli.learners.mixing`.
+        per_setting: each setting has a challenger of its own, as a retrained policy acts in one
+            setting only, in its share of the worlds. Otherwise one acts in all. Unset is false.
         ppo: as that of the retrained policies where a settings file is silent; in the student's
             worlds.
     """
@@ -190,6 +192,7 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     replay_episodes_per_round: Count = 2
     replay_capacity: Count = 200
     mixed_share: Fraction | UnsetType = UNSET
+    per_setting: bool | UnsetType = UNSET
     ppo: PPOConfig = PPOConfig()
 
 

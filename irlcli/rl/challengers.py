@@ -7,16 +7,18 @@ and poses that it would overpay are corrected before it is frozen.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec.structs import replace
 
 from irlcli.configs import ChallengerConfig
 from irlcli.rl.policy import Policy
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.worlds import Worlds
 from irlcli.seeds import derive
-from irlcli.trajectories import Rollout
+from irlcli.trajectories import Rollout, side_by_side
 
 
 class Challenged(Protocol):
@@ -27,18 +29,19 @@ class Challenged(Protocol):
 
 
 class Challengers:
-    """One challenger at a time; the next begins after ``config.life`` rounds.
+    """One challenger at a time, or one in each setting; the next begins after ``config.life`` rounds.
 
     Args:
-        worlds: those of the student. Every round starts fresh episodes in them.
+        worlds: of each challenger that acts at a time, in the order of their settings. Every round
+            starts fresh episodes in them.
         config: how they learn.
         learner: whose reward they are trained on.
-        seed, purpose: everything random of a challenger derives from them and its number.
+        seed, purpose: everything random of a challenger derives from them, its number and its worlds'.
     """
 
     def __init__(
         self,
-        worlds: Worlds,
+        worlds: Sequence[Worlds],
         config: ChallengerConfig,
         learner: Challenged,
         seed: int,
@@ -48,33 +51,39 @@ class Challengers:
         self._config = config
         self._learner = learner
         self._seed = seed
-        self._purpose = purpose
+        self._purpose = f"{purpose} challenger"
         self._life = 0
-        self._trainer = self._born(0)
+        self._trainers = self._born(0)
 
-    def _born(self, life: int) -> PPOTrainer:
-        ppo = self._config.ppo
-        steps = self._config.life * ppo.rollouts_per_round * ppo.n_steps * ppo.n_envs
-        seed = derive(f"{self._purpose} challenger", self._seed, life)[0]
-        return PPOTrainer(self._worlds, ppo, steps, seed, f"{self._purpose} challenger")
+    def _born(self, life: int) -> list[PPOTrainer]:
+        seeds = derive(self._purpose, self._seed, life, len(self._worlds))
+        return [
+            self._trainer(worlds, seed) for worlds, seed in zip(self._worlds, seeds, strict=True)
+        ]
+
+    def _trainer(self, worlds: Worlds, seed: int) -> PPOTrainer:
+        ppo = replace(self._config.ppo, n_envs=len(worlds))
+        return PPOTrainer(worlds, ppo, self._config.life * ppo.steps_per_round, seed, self._purpose)
 
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The rewards [T, N] of a rollout, by the reward as it is now."""
         return self._learner.challenger_rewards(rollout)
 
     def train_round(self, index: int) -> list[Rollout]:
-        """The rollouts of the challenger of round ``index``, updated on each of them."""
+        """The rollouts of the challengers of round ``index``, updated on each of them."""
         life, age = divmod(index, self._config.life)
         if life != self._life:
-            self._life, self._trainer = life, self._born(life)
-        return self._trainer.train_round(age, self)
+            self._life, self._trainers = life, self._born(life)
+        rollouts = [trainer.train_round(age, self) for trainer in self._trainers]
+        return [side_by_side(parts) for parts in zip(*rollouts, strict=True)]
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed run needs from the end of the last round."""
-        return {"life": self._life, "trainer": self._trainer.state_dict()}
+        return {"life": self._life, "trainers": [t.state_dict() for t in self._trainers]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state_dict()`` of equally configured challengers."""
         self._life = int(state["life"])
-        self._trainer = self._born(self._life)
-        self._trainer.load_state_dict(state["trainer"])
+        self._trainers = self._born(self._life)
+        for trainer, saved in zip(self._trainers, state["trainers"], strict=True):
+            trainer.load_state_dict(saved)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec import UNSET
+from msgspec.structs import replace
 
 from irlcli import labels
 from irlcli.configs import AIRLConfig
@@ -82,6 +84,8 @@ def request(
         )
     relevant = relevant_airl(airl, environment(env).discrete_actions)
     _check_rounds(relevant)
+    if trained == 1:
+        relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))
     if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
         raise UsageError(
             f"airl.batch_size = {airl.batch_size} cannot hold an even number of samples of each of "
@@ -167,7 +171,12 @@ def run(job: Job) -> None:
     settings = _trained(airl, p.settings)
     episodes, held_out = _episodes(job, settings)
     parsed = [parse_setting(env, text) for text in settings]
-    with closing(make_worlds(env, parsed, airl.ppo.n_envs, job.workers)) as worlds:
+    with ExitStack() as stack:
+
+        def worlds_of(chosen: Sequence[Setting], count: int) -> Worlds:
+            return stack.enter_context(closing(make_worlds(env, chosen, count, job.workers)))
+
+        worlds = worlds_of(parsed, airl.ppo.n_envs)
         trainer = PPOTrainer(
             worlds, airl.ppo, airl.total_steps, p.seed, STAGE.name, keep_moments=airl.bc_epochs > 0
         )
@@ -175,7 +184,11 @@ def run(job: Job) -> None:
         selector = _selector(p, learner, held_out, trainer.rounds)
         challengers = None
         if airl.challenger.life > 0:
-            challengers = Challengers(worlds, airl.challenger, learner, p.seed, STAGE.name)
+            theirs = [worlds]
+            if airl.challenger.per_setting is True:
+                share = airl.ppo.n_envs // len(parsed)
+                theirs = [worlds_of([setting], share) for setting in parsed]
+            challengers = Challengers(theirs, airl.challenger, learner, p.seed, STAGE.name)
         stop = _at_a_plateau(airl, len(settings))
         training = Training(trainer, learner, learner, selector, settings, challengers, stop)
         rows = run_training(job, training)

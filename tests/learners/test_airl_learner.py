@@ -293,7 +293,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(demos, changes):
         challengers = None
         if learner.config.challenger.life > 0:
             worlds = trainer._venv.worlds
-            challengers = Challengers(worlds, learner.config.challenger, learner, 0, "test")
+            challengers = Challengers([worlds], learner.config.challenger, learner, 0, "test")
         return Training(trainer, learner, learner, LastRound(), ["one", "other"], challengers)
 
     saved = []

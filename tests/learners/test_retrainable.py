@@ -136,7 +136,7 @@ def challenged(demos, **changes):
     trainer, learner = make(demos, horizon=HORIZON, total_steps=5 * 220 * 8, **changes)
     config = learner.config.challenger
     worlds = trainer._venv.worlds
-    return trainer, learner, Challengers(worlds, config, learner, 0, "test")
+    return trainer, learner, Challengers([worlds], config, learner, 0, "test")
 
 
 def test_each_challenger_starts_from_other_random_weights(demos):
@@ -146,7 +146,7 @@ def test_each_challenger_starts_from_other_random_weights(demos):
         before = index % 2 == 0
         challengers.train_round(index)
         if before:
-            first.append(challengers._trainer.policy.state_dict())
+            first.append(challengers._trainers[0].policy.state_dict())
     weights = [next(iter(s.values())) for s in first]
     assert not torch.equal(*weights)
 
