@@ -521,6 +521,18 @@ def test_unmixed_challengers_are_in_no_key():
     assert key(airl(none)) == key(airl(in_use())) != key(airl(half))
 
 
+def test_one_challenger_in_all_settings_is_in_no_key():
+    name = "airl.challenger.per_setting"
+    joint, own = (with_field(in_use(), name, value) for value in (False, True))
+    assert key(airl(joint)) == key(airl(in_use())) != key(airl(own))
+
+    # One of the two selects the round.
+    def alone(config):
+        return key(train_airl.request(From(demos(config)), ENV, SETTINGS[:2], config.airl))
+
+    assert alone(own) == alone(joint)
+
+
 def test_training_to_the_end_is_in_no_key():
     last = with_field(in_use(), "airl.select", "last")
     assert key(airl(last)) != key(airl(with_field(last, "airl.plateau_rounds", 10)))

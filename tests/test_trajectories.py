@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from irlcli.trajectories import Trajectory, transitions
+from irlcli.trajectories import Rollout, Trajectory, side_by_side, transitions
 
 
 def make_trajectory(steps, seed=0, terminated=True):
@@ -58,3 +58,23 @@ def test_transitions_count_the_steps_left_of_the_horizon():
         transitions([make_trajectory(11)], horizon=10)
     with pytest.raises(ValueError, match="at least one"):
         transitions([], horizon=10)
+
+
+def a_rollout(values, errors=()):
+    """Of three steps; each number of a world is its value in ``values``."""
+    world = np.broadcast_to(np.asarray(values, dtype=np.float64), (3, len(values)))
+    names = ("observations", "actions", "next_observations")
+    arrays = dict.fromkeys(names, world[..., None]) | dict.fromkeys(
+        ("log_probs", "true_rewards", "returns", "progress"), world
+    )
+    flags = dict.fromkeys(("terminated", "truncated"), world > 1.0)
+    return Rollout(**arrays, **flags, lengths=world.astype(np.int64), errors=tuple(errors))
+
+
+def test_rollouts_side_by_side_have_the_worlds_of_the_first_part_first():
+    parts = a_rollout([1.0, 2.0], [(1, "fell")]), a_rollout([3.0, 4.0, 5.0], [(0, "a"), (2, "b")])
+    found = side_by_side(parts)
+    np.testing.assert_array_equal(found.observations[0, :, 0], [1.0, 2.0, 3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(found.returns[2], [1.0, 2.0, 3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(found.terminated[1], [False, True, True, True, True])
+    assert found.errors == ((1, "fell"), (2, "a"), (4, "b"))

@@ -16,13 +16,16 @@ TRAIN = ["train-airl", "--demos", "demos", "--method", "irm", "--name", "airl"]
 TRANSFER = ["transfer", "--reward", "airl/reward.pt", "--ood", "1.5x", "--name", "moved"]
 
 
-def test_labels_tell_mixed_challengers_from_others():
+def test_labels_tell_kinds_of_challengers_apart():
+    mixed, own = {"mixed_share": 0.5}, {"per_setting": True}
     found = [
         labels.learned({"grouping": "pooled", "penalty": "none", "challenger": challenger})
-        for challenger in ({"life": 0}, {"life": 9}, {"life": 9, "mixed_share": 0.5})
+        for challenger in ({"life": 0}, *({"life": 9} | kind for kind in ({}, mixed, own)))
     ]
     assert "challengers" not in found[0]
-    assert found[1].endswith("with challengers") and found[2].endswith("with mixed challengers")
+    endings = ("with challengers", "with mixed challengers", "with challengers per setting")
+    for label, ending in zip(found[1:], endings, strict=True):
+        assert label.endswith(ending)
 
 
 def test_a_run_says_which_steps_resume(capsys):

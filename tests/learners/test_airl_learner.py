@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, make, moved, random_episodes
+from airl_runs import CONFIG, LANDER, SETTINGS, make, moved, random_episodes
 from msgspec.structs import replace
 
 from irlcli.configs import ChallengerConfig, PPOConfig
@@ -11,6 +11,7 @@ from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.learners import airl
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.loop import LastRound, Training
+from irlcli.rl.worlds import make_worlds
 from irlcli.trajectories import join
 
 # A round holds whole episodes at this time limit.
@@ -273,8 +274,8 @@ CHALLENGED = [
         "gradient_penalty": 1.0,
         "learning_rate_schedule": "linear",
     }
-    | {"challenger": ChallengerConfig(life=life, mixed_share=mixed, ppo=LONG)}
-    for life, mixed in ((1, 0.0), (2, 0.5))
+    | {"challenger": ChallengerConfig(life=life, mixed_share=mixed, per_setting=own, ppo=LONG)}
+    for life, mixed, own in ((1, 0.0, False), (2, 0.5, False), (2, 0.0, True))
 ]
 
 
@@ -292,8 +293,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one(demos, changes):
         )
         challengers = None
         if learner.config.challenger.life > 0:
-            worlds = trainer._venv.worlds
-            challengers = Challengers([worlds], learner.config.challenger, learner, 0, "test")
+            worlds = [trainer._venv.worlds]
+            if learner.config.challenger.per_setting:
+                worlds = [make_worlds(LANDER, [setting], 4) for setting in SETTINGS]
+            challengers = Challengers(worlds, learner.config.challenger, learner, 0, "test")
         return Training(trainer, learner, learner, LastRound(), ["one", "other"], challengers)
 
     saved = []

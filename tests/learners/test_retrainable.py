@@ -5,7 +5,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, LANDER, make, moved, random_episodes
+from airl_runs import CONFIG, LANDER, SETTINGS, make, moved, random_episodes
 from msgspec.structs import replace
 
 from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
@@ -18,7 +18,9 @@ from irlcli.learners.pools import Minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions
 from irlcli.penalties.risk import cross_entropy
+from irlcli.rl import worlds as worlds_module
 from irlcli.rl.challengers import Challengers
+from irlcli.rl.worlds import make_worlds
 
 LONG = PPOConfig(n_envs=8, n_steps=220, batch_size=512, n_epochs=1)
 HORIZON = 200
@@ -149,6 +151,51 @@ def test_each_challenger_starts_from_other_random_weights(demos):
             first.append(challengers._trainers[0].policy.state_dict())
     weights = [next(iter(s.values())) for s in first]
     assert not torch.equal(*weights)
+
+
+def test_each_settings_challenger_is_a_policy_of_its_own(demos):
+    """The first acts as it would alone; the second starts from other weights, in its own worlds."""
+    _, learner, _ = challenged(demos)
+
+    def rollouts(settings):
+        worlds = [make_worlds(LANDER, [setting], 4) for setting in settings]
+        found = Challengers(worlds, learner.config.challenger, learner, 0, "test")
+        return found, found.train_round(0)[0]
+
+    both, beside = rollouts(SETTINGS)
+    _, alone = rollouts(SETTINGS[:1])
+    _, equal = rollouts(SETTINGS[:1] * 2)
+    assert beside.observations.shape[1] == 8
+    for field in ("observations", "actions", "true_rewards", "returns"):
+        np.testing.assert_array_equal(getattr(beside, field)[:, :4], getattr(alone, field))
+    assert not np.array_equal(beside.observations[:, 4:], equal.observations[:, 4:])
+    weights = [next(iter(t.policy.state_dict().values())) for t in both._trainers]
+    assert not torch.equal(*weights)
+
+
+def test_challengers_per_setting_share_the_worlds_in_the_order_of_the_settings(
+    irl, smoke_store, tmp_path, monkeypatch
+):
+    made, original = [], worlds_module.make_worlds
+
+    def record(env, settings, count, workers=1):
+        made.append(([str(setting) for setting in settings], count))
+        return original(env, settings, count, workers)
+
+    monkeypatch.setattr(worlds_module, "make_worlds", record)
+    line = ["train-airl", "--demos", smoke_store.path / smoke_store.demos]
+    line += ["--profile", "smoke", "--store", tmp_path]
+    for option in (
+        "logit=f",
+        "policy_reward=f",
+        "challenger.life=1",
+        "challenger.per_setting=true",
+    ):
+        line += ["--set", f"airl.{option}"]
+    done = irl(*line)
+    assert done.code == 0, done.err
+    one, two = (str(setting) for setting in SETTINGS)
+    assert made == [([one, two], 4), ([one], 2), ([two], 2)]
 
 
 def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
