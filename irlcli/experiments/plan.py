@@ -159,8 +159,9 @@ class Plan:
         self.tasks = {name: task for name, task in self.tasks.items() if name in kept}
 
     def configs(self, env: str) -> Config:
-        """The config of ``env``, without any method's flags."""
-        return self._configs(env, None)
+        """The config of ``env``, without any method's flags: the base's, if there are variants."""
+        variants = self.table.variants
+        return (self._under[variants[0]] if variants else self._configs)(env, None)
 
     def step(self, name: str) -> Step:
         """The state of the step called ``name``; what it waits for is named as in the plan."""

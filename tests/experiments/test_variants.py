@@ -216,6 +216,20 @@ def test_the_report_holds_shares_of_the_experts(made):
     assert variants["agent"].iloc[0] == "full" and len(variants) == 4
 
 
+def test_budgets_are_those_of_the_base(made, irl, tmp_path):
+    store, _, _ = made
+    file = tmp_path / "tables.toml"
+    file.write_text(TABLES.replace('"full" = []', '"full" = ["transfer.restarts=3"]'))
+    line = ["report", "parts", "--experiments", file, "--profile", "smoke", "--seeds", "0"]
+    done = irl(*line, "--store", store, "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    rows = (tmp_path / "out" / "README.md").read_text().splitlines()
+    (header,) = (row for row in rows if "transfer steps" in row)
+    steps = rows[rows.index(header) + 2].split("|")[header.split("|").index(" transfer steps ")]
+    # Three policies of 2,048 steps.
+    assert steps.strip() == "6,144"
+
+
 def test_variants_that_change_nothing_are_named(made):
     _, out, done = made
     text = (out / "README.md").read_text()
