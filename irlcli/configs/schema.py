@@ -182,8 +182,8 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             see :mod:`irlcli.learners.mixing`.
         per_setting: each setting has a challenger of its own, as a retrained policy acts in one
             setting only, in its share of the worlds. Otherwise one acts in all. Unset is false.
-        ppo: as that of the retrained policies where a settings file is silent; in the student's
-            worlds.
+        ppo: as that of the retrained policies where a settings file is silent; with as many worlds
+            as the student.
     """
 
     life: NonNegativeCount = 0

@@ -36,7 +36,7 @@ class Challengers:
             starts fresh episodes in them.
         config: how they learn.
         learner: whose reward they are trained on.
-        seed, purpose: everything random of a challenger derives from them, its number and its worlds'.
+        seed, purpose: everything random of a challenger derives from them, its number and its setting.
     """
 
     def __init__(
