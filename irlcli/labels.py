@@ -107,11 +107,18 @@ def learned(config: Mapping[str, Any]) -> str:
             f"dropping {_number(dropout)}" if dropout else None,
             f"selected by {select}" if select != "last" else None,
             "from a clone" if config.get("bc_epochs") else None,
-            f"mean of {rounds} rounds" if (rounds := config.get("averaged_rounds")) else None,
+            _averaged(config),
             "to a plateau" if config.get("plateau_rounds") else None,
             _challenged(challenger) if isinstance(challenger, dict) else None,
         ]
     )
+
+
+def _averaged(config: Mapping[str, Any]) -> str | None:
+    if not config.get("averaged_rounds"):
+        return None
+    weighted = "weighted " if config.get("averaged_by") == "learning-rate" else ""
+    return f"{weighted}mean of {config['averaged_rounds']} rounds"
 
 
 def _challenged(challenger: Mapping[str, Any]) -> str | None:

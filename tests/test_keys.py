@@ -232,10 +232,10 @@ REQUESTS = {
 # Reports read evaluations that are named one by one; no config field reaches them otherwise.
 REPORTS = {"report", "report-experts"}
 # AIRL refuses gSDE, so its frequency is not read. Challengers act in the student's worlds. Logits of
-# f alone have one scaling.
+# f alone have one scaling. Nothing is averaged.
 UNREAD_AIRL = [
     *("airl.ppo.sde_sample_freq", "airl.challenger.ppo.n_envs"),
-    "airl.penalty_scaling",
+    *("airl.penalty_scaling", "airl.averaged_by"),
 ]
 # What a stage does not read, whatever the other fields are.
 UNREAD = {
@@ -279,6 +279,7 @@ CHANGED = {
     "airl.dropout": 0.5,
     "airl.columns": (-1,),
     "airl.averaged_rounds": 3,
+    "airl.averaged_by": "learning-rate",
     "airl.plateau_rounds": 3,
     "airl.challenger.mixed_share": 0.5,
     "airl.challenger.per_setting": True,
@@ -513,6 +514,25 @@ def test_the_last_round_alone_is_in_no_key():
     last = with_field(in_use(), "airl.select", "last")
     one, three = (with_field(last, "airl.averaged_rounds", rounds) for rounds in (1, 3))
     assert key(airl(one)) == key(airl(last)) != key(airl(three))
+
+
+def test_rounds_of_equal_weight_are_in_no_key():
+    averaged = {
+        "airl.select": "last",
+        "airl.learning_rate_schedule": "linear",
+        "airl.averaged_rounds": 3,
+    }
+    base = in_use()
+    for name, value in averaged.items():
+        base = with_field(base, name, value)
+    equal, weighted = (
+        with_field(base, "airl.averaged_by", by) for by in ("rounds", "learning-rate")
+    )
+    assert key(airl(equal)) == key(airl(base)) != key(airl(weighted))
+    # At a constant rate all rounds weigh the same, and one round alone has no weight.
+    for name, value in (("airl.learning_rate_schedule", "constant"), ("airl.averaged_rounds", 1)):
+        one, other = (with_field(config, name, value) for config in (weighted, equal))
+        assert key(airl(one)) == key(airl(other))
 
 
 def test_unmixed_challengers_are_in_no_key():

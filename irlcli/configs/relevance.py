@@ -128,8 +128,10 @@ def _network(airl: AIRLConfig) -> AIRLConfig:
 
 def _kept_rounds(airl: AIRLConfig) -> AIRLConfig:
     """Refuse two rules for the rounds that are kept; reset what the rule in use does not read."""
+    if airl.averaged_by == "rounds" or airl.learning_rate_schedule == "constant":
+        airl = replace(airl, averaged_by=UNSET)
     if airl.averaged_rounds in (UNSET, 1):
-        airl = replace(airl, averaged_rounds=UNSET)
+        airl = replace(airl, averaged_rounds=UNSET, averaged_by=UNSET)
     elif airl.select != "last":
         raise UsageError(
             f"airl.averaged_rounds = {airl.averaged_rounds} cannot be combined with airl.select = "

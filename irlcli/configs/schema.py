@@ -30,6 +30,7 @@ Discount = Annotated[float, Meta(ge=0, lt=1)]
 Widths = Annotated[tuple[Annotated[int, Meta(ge=1, le=1024)], ...], Meta(max_length=6)]
 Schedule = Literal["constant", "linear"]
 Activation = Literal["tanh", "relu"]
+Averaged = Literal["rounds", "learning-rate"]
 Grouping = Literal["pooled", "balanced", "per-setting", "shuffled"]
 
 
@@ -231,6 +232,9 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             from the end. The policy sees all. Unset (or empty) is all, and in no key.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
             equally spaced up to the last. Unset (or 1) is the last g alone, and in no key.
+        averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
+            the discriminator's ``learning-rate``, so that early rounds count more when it falls.
+            Unset is ``rounds``, and in no key.
         plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is
             near chance and has not risen for so many rounds, those of the penalty's warm-up and ramp
             not counted (:mod:`irlcli.learners.stopping`). Unset trains to the end, and is in no key.
@@ -276,6 +280,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     dropout: Dropout | UnsetType = UNSET
     columns: Columns | UnsetType = UNSET
     averaged_rounds: Members | UnsetType = UNSET
+    averaged_by: Averaged | UnsetType = UNSET
     plateau_rounds: Count | UnsetType = UNSET
 
 

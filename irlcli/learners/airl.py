@@ -22,6 +22,7 @@ the state too often.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any
@@ -33,6 +34,7 @@ from irlcli.configs.schema import AIRLConfig
 from irlcli.data.descriptions import RewardNetwork
 from irlcli.errors import StageFailed
 from irlcli.learners.actions import ActionView, Policy
+from irlcli.learners.averaging import averaged_after
 from irlcli.learners.cloning import clone
 from irlcli.learners.discriminator import (
     Loss,
@@ -143,8 +145,10 @@ class AIRL:
         self.network = RewardNetwork(**shape, members=members)
         torch.manual_seed(derive("discriminator", seed, -1)[0])
         self.model = RewardModel(**shape, dropout=config.dropout or 0.0).eval()
-        # The rounds after which g joins the mean that is frozen; see AveragedReward.
-        self._joins = {rounds * k // members - 1 for k in range(1, members + 1)}
+        weighted = config.averaged_by == "learning-rate"
+        weights = [self._rate(index) if weighted else 1.0 for index in range(rounds)]
+        # How often g joins the mean that is frozen after which rounds; see AveragedReward.
+        self._joins = Counter(averaged_after(weights, members))
         self._members: list[RewardModel] = []
         # Decoupled, so that dividing the loss by lambda does not make the decay lambda times
         # stronger.
@@ -246,8 +250,9 @@ class AIRL:
             for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
                 for setting, (data, numbers) in enumerate(found):
                     replay.add(setting, data, numbers, rng)
-        if index in self._joins and self.network.members > 1:
-            self._members.append(deepcopy(self.model).requires_grad_(False))
+        if self.network.members > 1:
+            for _ in range(self._joins[index]):
+                self._members.append(deepcopy(self.model).requires_grad_(False))
         self.scale = reward_scale(self.deployed, [*current, *expert])
         optimised_cross_entropy, optimised_penalty = np.mean(losses, 0)
         return [
@@ -273,7 +278,8 @@ class AIRL:
             StageFailed: the parameters stopped being finite.
         """
         config = self.config
-        self._set_learning_rate(index)
+        for parameters in self._optimizer.param_groups:
+            parameters["lr"] = self._rate(index)
         losses = []
         self.model.train()
         with torch.random.fork_rng(devices=[]):
@@ -331,11 +337,11 @@ class AIRL:
             slope,
         )
 
-    def _set_learning_rate(self, index: int) -> None:
-        if self.config.learning_rate_schedule == "linear":
-            rate = self.config.learning_rate * max(0.0, 1.0 - index / self._rounds)
-            for group in self._optimizer.param_groups:
-                group["lr"] = rate
+    def _rate(self, index: int) -> float:
+        """The discriminator's learning rate in round ``index``."""
+        if self.config.learning_rate_schedule == "constant":
+            return self.config.learning_rate
+        return self.config.learning_rate * max(0.0, 1.0 - index / self._rounds)
 
     def _generated(self, rollouts: Sequence[Rollout]) -> list[tuple[Transitions, np.ndarray]]:
         """Each setting's transitions of this round, and the numbers of their episodes."""

@@ -374,6 +374,27 @@ def test_the_deployed_reward_is_the_mean_over_equally_spaced_rounds(demos, tmp_p
     torch.testing.assert_close(model.reward(states, actions), expected)
 
 
+def test_rounds_can_be_averaged_by_the_learning_rate(demos):
+    changes = {"averaged_rounds": 3, "averaged_by": "learning-rate"}
+    trainer, learner = make(
+        demos,
+        ppo=LONG,
+        horizon=HORIZON,
+        total_steps=6 * 220 * 8,
+        learning_rate_schedule="linear",
+        **changes,
+    )
+    after = []
+    for index in range(6):
+        (rollout,) = trainer.train_round(index, learner)
+        learner.update(index, [rollout], trainer.policy)
+        after.append(deepcopy(learner.model))
+    states, actions = torch.randn(7, 8) * 3, torch.eye(4)[torch.randint(4, (7,))]
+    # The rates are as 6, 5, 4, 3, 2, 1: a third of their sum is 7.
+    expected = sum(after[index].reward(states, actions) for index in (0, 1, 5)) / 3
+    torch.testing.assert_close(learner.deployed.reward(states, actions), expected)
+
+
 def test_a_mean_has_no_best_round():
     config = AIRLConfig(averaged_rounds=2, select="episodes")
     with pytest.raises(UsageError, match="averaged_rounds = 2 cannot be combined"):
