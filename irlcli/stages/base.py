@@ -296,8 +296,8 @@ def _report(job: Job, training: "Training | Restarts", newest: "list[Row]") -> N
         accuracy = sum(row["accuracy"] for row in newest) / len(newest)
         facts["discriminator"] = f"accuracy {accuracy:.2f}"
     if "challenger_return" in newest[0]:
-        returns = [row["challenger_return"] for row in newest]
-        facts["challenger"] = f"return {sum(returns) / len(returns):.0f}"
+        # In the order of the settings.
+        facts["challenger"] = "return " + ", ".join(f"{r['challenger_return']:.0f}" for r in newest)
     job.console.progress(training.steps, training.planned_steps, "steps", facts)
     scalars = {
         f"{row['setting']}/{name}": float(value)

@@ -28,6 +28,17 @@ def test_labels_tell_kinds_of_challengers_apart():
         assert label.endswith(ending)
 
 
+def test_labels_tell_means_of_rounds_apart():
+    averaged = {"averaged_rounds": 30}
+    last, equal, weighted = (
+        labels.learned({"grouping": "pooled", "penalty": "none"} | mean)
+        for mean in ({}, averaged, averaged | {"averaged_by": "learning-rate"})
+    )
+    assert "mean" not in last
+    assert equal.endswith(" mean of 30 rounds") and "weighted" not in equal
+    assert weighted.endswith(" weighted mean of 30 rounds")
+
+
 def test_a_run_says_which_steps_resume(capsys):
     shown = jobs.PlainJobs(console.TerminalConsole())
     shown.line("standard.step", "RESUME train-airl erm seed 0")
