@@ -132,11 +132,12 @@ def _check_selection(airl: AIRLConfig, settings: Sequence[str]) -> None:
 
 
 def _check_rounds(airl: AIRLConfig) -> None:
-    rounds = airl.ppo.rounds(airl.total_steps)
-    if (airl.averaged_rounds or 1) > rounds:
+    rounds, averaged = airl.ppo.rounds(airl.total_steps), airl.averaged_rounds or 1
+    if averaged > rounds:
         raise UsageError(
-            f"airl.averaged_rounds = {airl.averaged_rounds}, but training has {rounds} rounds",
-            f"--set airl.averaged_rounds={rounds} or less",
+            f"airl.averaged_rounds = {averaged}, but training has {rounds} rounds",
+            f"--set airl.averaged_rounds={rounds} or less, or --set airl.total_steps="
+            f"{averaged * airl.ppo.steps_per_round} or more",
         )
     # Rounds that the plateau can be found in, before the last.
     compared = rounds - 1 - airl.penalty_warmup_rounds - airl.penalty_ramp_rounds
