@@ -231,7 +231,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Unset (or empty) is all, and in no key.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
-            equally spaced up to the last. Unset (or 1) is the last g alone, and in no key.
+            spaced as ``averaged_by`` says, up to the last. Unset (or 1) is the last g alone, and in
+            no key.
         averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
             the discriminator's ``learning-rate``, so that early rounds count more when it falls.
             Unset is ``rounds``, and in no key.

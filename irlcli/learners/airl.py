@@ -147,7 +147,7 @@ class AIRL:
         self.model = RewardModel(**shape, dropout=config.dropout or 0.0).eval()
         weighted = config.averaged_by == "learning-rate"
         weights = [self._rate(index) if weighted else 1.0 for index in range(rounds)]
-        # How often g joins the mean that is frozen after which rounds; see AveragedReward.
+        # Round -> how many times its g joins the frozen mean; see AveragedReward.
         self._joins = Counter(averaged_after(weights, members))
         self._members: list[RewardModel] = []
         # Decoupled, so that dividing the loss by lambda does not make the decay lambda times

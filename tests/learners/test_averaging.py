@@ -34,5 +34,5 @@ def test_a_round_with_most_of_the_weight_joins_several_times():
     assert averaged_after([1.0, 7.0, 1.0, 1.0], 5) == [0, 0, 0, 1, 3]
 
 
-def test_rounds_without_weight_add_nothing():
+def test_only_the_last_of_the_rounds_without_weight_joins():
     assert averaged_after([1.0, 0.0, 0.0], 2) == [0, 2]
