@@ -117,8 +117,8 @@ def learned(config: Mapping[str, Any]) -> str:
 def _averaged(config: Mapping[str, Any]) -> str | None:
     if not config.get("averaged_rounds"):
         return None
-    weighted = "weighted " if config.get("averaged_by") == "learning-rate" else ""
-    return f"{weighted}mean of {config['averaged_rounds']} rounds"
+    weighted = " by learning rate" if config.get("averaged_by") == "learning-rate" else ""
+    return f"mean of {config['averaged_rounds']} rounds{weighted}"
 
 
 def _challenged(challenger: Mapping[str, Any]) -> str | None:

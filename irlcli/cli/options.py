@@ -51,7 +51,14 @@ def _stage_session(
     settings: Annotated[
         Path | None, typer.Option(help="TOML file that overrides the profile.")
     ] = None,
-    overrides: Annotated[list[str], typer.Option("--set", help="FIELD=VALUE, repeatable.")] = [],  # noqa: B006
+    overrides: Annotated[
+        list[str],
+        typer.Option(
+            "--set",
+            help="FIELD=VALUE, e.g. airl.total_steps=100000. Repeatable. "
+            "An unknown FIELD lists the known ones.",
+        ),
+    ] = [],  # noqa: B006
     sources: Annotated[
         list[str],
         typer.Option(

@@ -79,7 +79,7 @@ def request(
     trained = len(_trained(airl, texts))
     if airl.ppo.n_envs % trained:
         raise UsageError(
-            f"{airl.ppo.n_envs} worlds cannot be shared equally by {trained} settings",
+            f"airl.ppo.n_envs = {airl.ppo.n_envs}: the worlds cannot be shared equally by {trained} settings",
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
     relevant = relevant_airl(airl, environment(env).discrete_actions)

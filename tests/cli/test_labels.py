@@ -36,7 +36,7 @@ def test_labels_tell_means_of_rounds_apart():
     )
     assert "mean" not in last
     assert equal.endswith(" mean of 30 rounds") and "weighted" not in equal
-    assert weighted.endswith(" weighted mean of 30 rounds")
+    assert weighted.endswith(" mean of 30 rounds by learning rate")
 
 
 def test_a_run_says_which_steps_resume(capsys):
