@@ -120,14 +120,14 @@ def _penalty(
     if name in _ADDITIVE:
         parameters = tuple(networks.parameters())
 
-        def slope() -> torch.Tensor:
+        def input_gradient() -> torch.Tensor:
             points = samples.mean(2).requires_grad_()
             (by_input,) = torch.autograd.grad(networks(points).sum(), points, create_graph=True)
             return by_input.square().sum(-1).mean((1, 2)).sum()
 
         # Only the weights and the summed risks mean anything here: a run's risk depends on its own
         # weights alone.
-        seen = Samples(logits[0], logits[0], risks.sum(0), weights, parameters, slope)
+        seen = Samples(logits[0], logits[0], risks.sum(0), weights, parameters, input_gradient)
         return penalty(seen, options)
 
     def of_one(own: torch.Tensor, entropies: torch.Tensor) -> torch.Tensor:

@@ -239,12 +239,13 @@ class AIRL:
         )
         current = [self._pool(data, policy) for data, _ in generated]
         expert = [self._pool(join(episodes), policy) for episodes in self._demonstrations]
-        sources = [self._risks(current, self._replay, expert, policy)]
+        risks = self._risks(current, self._replay, expert, policy)
+        challenger_risks = None
         if challenged:
             pools = [self._pool(data, None) for data, _ in challenged]
-            sources.append(self._risks(pools, self._challenger_replay, expert, None))
+            challenger_risks = self._risks(pools, self._challenger_replay, expert, None)
         generator = torch.Generator().manual_seed(derive("discriminator", self._seed, index)[0])
-        losses = self._optimise(index, sources, weight, generator)
+        losses = self._optimise(index, risks, challenger_risks, weight, generator)
         if config.replay_share > 0.0:
             rng = np.random.default_rng(derive("replay", self._seed, index)[0])
             for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
@@ -268,7 +269,8 @@ class AIRL:
     def _optimise(
         self,
         index: int,
-        sources: Sequence[Sequence[Sequence[Stratum]]],
+        risks: Sequence[Sequence[Stratum]],
+        challenger_risks: Sequence[Sequence[Stratum]] | None,
         weight: float,
         generator: torch.Generator,
     ) -> list[tuple[float, float]]:
@@ -286,11 +288,13 @@ class AIRL:
             # For dropout, which takes no generator.
             torch.manual_seed(derive("dropout", self._seed, index)[0])
             for _ in range(config.updates_per_round):
-                batches = [sample_minibatch(s, generator, config.replay_share) for s in sources]
-                if config.challenger.mixed_share:
-                    share = config.challenger.mixed_share
-                    batches[1:] = [mixed(batch, share, generator) for batch in batches[1:]]
-                loss = self._loss(batches, weight, generator)
+                batch = sample_minibatch(risks, generator, config.replay_share)
+                challenger = None
+                if challenger_risks is not None:
+                    challenger = sample_minibatch(challenger_risks, generator, config.replay_share)
+                    if config.challenger.mixed_share:
+                        challenger = mixed(challenger, config.challenger.mixed_share, generator)
+                loss = self._loss(batch, challenger, weight, generator)
                 self._optimizer.zero_grad()
                 loss.total.backward()
                 torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
@@ -305,36 +309,38 @@ class AIRL:
         return losses
 
     def _loss(
-        self, batches: Sequence[Minibatch], weight: float, generator: torch.Generator
+        self,
+        batch: Minibatch,
+        challenger: Minibatch | None,
+        weight: float,
+        generator: torch.Generator,
     ) -> Loss:
         """The loss on a minibatch of the student's samples, and one of a challenger's."""
         config = self.config
-        logits = [discriminator_logits(self.model, batch, config.logit) for batch in batches]
-        share, beside = 1.0, torch.zeros(())
-        for challenged, _ in logits[1:]:
-            share = 1.0 - config.challenger.share
-            risk = (self._weights * cross_entropy(challenged)).sum()
-            beside = beside + config.challenger.share * risk
+        logits, f = discriminator_logits(self.model, batch, config.logit)
+        challenger_logits = None
+        if challenger is not None:
+            challenger_logits, _ = discriminator_logits(self.model, challenger, config.logit)
 
-        def slope() -> torch.Tensor:
-            slopes = []
-            for batch in batches:
-                mix = torch.rand(*batch.log_probs[:, 0].shape, 1, generator=generator)
-                slopes.append(gradient_penalty(self.model, batch, mix))
-            return torch.stack(slopes).mean()
+        def input_gradient() -> torch.Tensor:
+            found = []
+            for part in (batch,) if challenger is None else (batch, challenger):
+                mix = torch.rand(*part.log_probs[:, 0].shape, 1, generator=generator)
+                found.append(gradient_penalty(self.model, part, mix))
+            return torch.stack(found).mean()
 
-        if config.gradient_penalty > 0.0:
-            beside = beside + config.gradient_penalty * slope()
         return discriminator_loss(
-            *logits[0],
+            logits,
+            f,
             self._weights,
-            config.grouping == "balanced",
-            config.penalty,
-            self._penalty_options(weight),
-            share,
-            beside,
-            tuple(self.model.parameters()),
-            slope,
+            merge_risks=config.grouping == "balanced",
+            penalty=config.penalty,
+            options=self._penalty_options(weight),
+            challenger_logits=challenger_logits,
+            challenger_share=config.challenger.share,
+            input_gradient=input_gradient,
+            input_gradient_weight=config.gradient_penalty,
+            parameters=tuple(self.model.parameters()),
         )
 
     def _rate(self, index: int) -> float:
@@ -389,7 +395,7 @@ class AIRL:
                 Stratum(
                     policy=join_pools(paired(current, part)),
                     expert=join_pools([demonstrated(e, i) for e, i in part.episodes.items()]),
-                    past=(join_pools(paired(past, part)),) if past else (),
+                    past=join_pools(paired(past, part)) if past else None,
                     count=count,
                 )
                 for part, count in zip(members.parts, counts, strict=True)
@@ -403,7 +409,7 @@ class AIRL:
         """Per setting, whatever the grouping, so that methods can be compared."""
         found = []
         risks = [
-            [Stratum(policy, expert_, (), _DIAGNOSTIC_SAMPLES)]
+            [Stratum(policy, expert_, None, _DIAGNOSTIC_SAMPLES)]
             for policy, expert_ in zip(current, expert, strict=True)
         ]
         with torch.no_grad():

@@ -44,7 +44,10 @@ def gradient_penalty(model: RewardModel, batch: Minibatch, mix: torch.Tensor) ->
 
 
 class Loss(NamedTuple):
-    """A minibatch's loss and what it consists of, all scalar tensors."""
+    """A minibatch's loss and two of its parts, all scalar tensors.
+
+    ``cross_entropy`` is the student's, BCE, with weight one.
+    """
 
     total: torch.Tensor
     cross_entropy: torch.Tensor
@@ -55,40 +58,55 @@ def discriminator_loss(
     logits: torch.Tensor,
     f: torch.Tensor,
     weights: torch.Tensor,
-    one_risk: bool,
+    merge_risks: bool,
     penalty: str,
     options: PenaltyOptions,
-    share: float = 1.0,
-    beside: torch.Tensor | float = 0.0,
+    challenger_logits: torch.Tensor | None = None,
+    challenger_share: float = 0.0,
+    input_gradient: Callable[[], torch.Tensor] | None = None,
+    input_gradient_weight: float = 0.0,
     parameters: Sequence[torch.Tensor] = (),
-    slope: Callable[[], torch.Tensor] | None = None,
 ) -> Loss:
-    """(share sum_e w_e BCE_e + beside + lambda penalty) / max(1, lambda) (paper Eq. 5, Algorithm 1).
+    """((1 - s) BCE + s BCE_challenger + c GP + lambda penalty) / max(1, lambda).
 
-    The paper sums over settings where this averages. Dividing by lambda keeps the gradient's size
+    Paper Eq. 5 and Algorithm 1, with the parts that make a reward retrainable. BCE is the mean
+    sum_e w_e BCE_e; the paper sums over settings. Dividing by lambda keeps the gradient's size
     when the penalty dominates; a bounded one does not (:func:`irlcli.penalties.loss_divisor`).
     Penalties of risks do not see challengers: they are so easy to distinguish from experts that the
     penalty would be small for any reward. ``input-gradient`` sees them.
 
     Args:
-        logits: f - log pi [E, 2, B].
+        logits: of the student's and the experts' samples [E, 2, B].
         f: the learned part [E, 2, B].
         weights: w [E], in sum one.
-        one_risk: whether the penalty sees all E as one risk (``balanced``).
+        merge_risks: whether the penalty sees all E as one risk (``balanced``).
         penalty: a key of ``irlcli.penalties.PENALTIES``.
         options: how the penalty is estimated, and lambda.
-        share: of this cross-entropy in the loss; the challengers' has the rest.
-        beside: what else is minimised, a scalar.
-        parameters, slope: of the discriminator, see :class:`irlcli.penalties.Samples`.
+        challenger_logits: of a challenger's and the experts' samples [E, 2, B]; None: there is none.
+        challenger_share: s.
+        input_gradient: GP, the mean squared gradient of g by its input, computed when called.
+        input_gradient_weight: c.
+        parameters: of the discriminator, see :class:`irlcli.penalties.Samples`.
     """
+    student_share, others = 1.0, torch.zeros(())
+    if challenger_logits is not None:
+        student_share = 1.0 - challenger_share
+        challenged = (weights * cross_entropy(challenger_logits)).sum()
+        others = others + challenger_share * challenged
+    if input_gradient is not None and input_gradient_weight > 0.0:
+        others = others + input_gradient_weight * input_gradient()
     risks = cross_entropy(logits)
     risk = (weights * risks).sum()
-    seen = Samples(logits, f, risks, share * weights, tuple(parameters), slope)
-    if one_risk:
-        one = share * weights.sum(0, keepdim=True)
-        seen = seen._replace(logits=_merged(logits), f=_merged(f), risks=risk[None], weights=one)
+    seen = Samples(logits, f, risks, student_share * weights, tuple(parameters), input_gradient)
+    if merge_risks:
+        seen = seen._replace(
+            logits=_merged(logits),
+            f=_merged(f),
+            risks=risk[None],
+            weights=student_share * weights.sum(0, keepdim=True),
+        )
     penalised = discriminator_penalty(penalty)(seen, options)
-    total = share * risk + beside
+    total = student_share * risk + others
     if options.weight > 0.0:
         total = total + options.weight * penalised
         total = total / loss_divisor(penalty, options.weight)

@@ -84,13 +84,13 @@ class Minibatch:
 class Stratum:
     """What one part of a risk is drawn from.
 
-    ``past`` holds the policy's earlier rounds; empty without replay. ``count`` is the number of
+    ``past`` holds the policy's earlier rounds; None without replay. ``count`` is the number of
     samples of either label, at least 2 and even.
     """
 
     policy: Pool
     expert: Pool
-    past: tuple[Pool, ...]
+    past: Pool | None
     count: int
 
 
@@ -110,11 +110,10 @@ def sample_minibatch(
     def stacked(stratum: Stratum) -> list[torch.Tensor]:
         # Even, so that the even and the odd samples hold as many past ones: the unbiased penalty
         # multiplies their gradients.
-        earlier = 2 * round(stratum.count * past_share / 2) if stratum.past else 0
+        earlier = 0 if stratum.past is None else 2 * round(stratum.count * past_share / 2)
         generated = draw(stratum.policy, stratum.count - earlier)
-        if earlier:
-            (past,) = stratum.past
-            both = zip(generated, draw(past, earlier), strict=True)
+        if stratum.past is not None and earlier:
+            both = zip(generated, draw(stratum.past, earlier), strict=True)
             generated = [torch.cat(pair) for pair in both]
         pairs = zip(generated, draw(stratum.expert, stratum.count), strict=True)
         return [torch.stack(pair) for pair in pairs]

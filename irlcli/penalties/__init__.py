@@ -31,7 +31,7 @@ class Samples(NamedTuple):
         weights: of the risks in the loss [E]. Only group-dro uses them; to the other penalties all
             risks are equal.
         parameters: what the discriminator learns.
-        slope: the mean squared gradient of g by its input, a scalar, computed when called.
+        input_gradient: the mean squared gradient of g by its input, a scalar, computed when called.
     """
 
     logits: "torch.Tensor"
@@ -39,7 +39,7 @@ class Samples(NamedTuple):
     risks: "torch.Tensor"
     weights: "torch.Tensor"
     parameters: "tuple[torch.Tensor, ...]" = ()
-    slope: "Callable[[], torch.Tensor] | None" = None
+    input_gradient: "Callable[[], torch.Tensor] | None" = None
 
 
 class PenaltyOptions(NamedTuple):

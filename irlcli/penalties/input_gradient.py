@@ -17,5 +17,5 @@ if TYPE_CHECKING:
 
 def discriminator(samples: Samples, options: PenaltyOptions) -> torch.Tensor:
     """mean ||d g / d x||^2 at points x between policy and expert samples, a scalar."""
-    assert samples.slope is not None
-    return samples.slope()
+    assert samples.input_gradient is not None
+    return samples.input_gradient()

@@ -180,8 +180,8 @@ def test_minibatch_layout_and_share_of_the_past():
         return make_pool(model, data, torch.zeros(20), False)
 
     risks = [
-        [Stratum(constant(0), constant(2), (constant(4),), 8)],
-        [Stratum(constant(1), constant(3), (constant(5),), 8)],
+        [Stratum(constant(0), constant(2), constant(4), 8)],
+        [Stratum(constant(1), constant(3), constant(5), 8)],
     ]
     batch = sample_minibatch(risks, torch.Generator().manual_seed(0), 0.25)
     assert batch.observations.shape == (2, 2, 8, 8)
@@ -202,7 +202,7 @@ def test_even_and_odd_samples_hold_as_many_past_ones(count):
         pool = make_pool(model, data, torch.zeros(5), False)
         return replace(pool, observations=observations)
 
-    stratum = Stratum(constant(0), constant(1), (constant(2),), count)
+    stratum = Stratum(constant(0), constant(1), constant(2), count)
     batch = sample_minibatch([[stratum, stratum]], torch.Generator().manual_seed(0), 0.5)
     past = batch.observations[0, 0, :, 0] == 2
     assert past[::2].sum() == past[1::2].sum()
@@ -279,7 +279,7 @@ def test_trained_discriminator_is_the_density_ratio():
     optimizer = torch.optim.Adam(model.parameters(), lr=0.01)
     generator = torch.Generator().manual_seed(0)
     for _ in range(600):
-        batch = sample_minibatch([[Stratum(policy, expert, (), 256)]], generator)
+        batch = sample_minibatch([[Stratum(policy, expert, None, 256)]], generator)
         logits, f = discriminator.discriminator_logits(model, batch)
         loss = discriminator.discriminator_loss(
             logits, f, torch.ones(1), False, "none", PenaltyOptions(weight=0.0)

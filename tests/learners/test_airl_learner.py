@@ -38,8 +38,8 @@ def test_the_logged_objective_is_the_one_that_was_optimised(demos, monkeypatch):
     seen = []
     original = airl.discriminator_loss
 
-    def spy(*arguments):
-        loss = original(*arguments)
+    def spy(*arguments, **options):
+        loss = original(*arguments, **options)
         seen.append(loss)
         return loss
 
@@ -222,7 +222,7 @@ def test_a_risk_meets_the_policys_samples_of_its_own_setting_or_of_all(demos, pa
     learner.update(0, rollouts, trainer.policy)
     pools = [learner._pool(data, None) for data, _ in learner._generated(rollouts)]
     risks = learner._risks(pools, learner._replay, pools, None)
-    for which in (lambda stratum: stratum.policy, lambda stratum: stratum.past[0]):
+    for which in (lambda stratum: stratum.policy, lambda stratum: stratum.past):
         assert [set(which(s).observations.unique().tolist()) for (s,) in risks] == met
 
 

@@ -99,13 +99,21 @@ def test_what_else_is_minimised_is_not_part_of_the_penalty(weight):
     options = PenaltyOptions("logit", unbiased=False, weight=weight)
     arguments = (logit, logit, weights, False, "irmv1", options)
     alone = discriminator.discriminator_loss(*arguments)
-    both = discriminator.discriminator_loss(*arguments, share=0.3, beside=torch.tensor(7.0))
+    challenger = torch.randn(2, 2, 6)
+    both = discriminator.discriminator_loss(
+        *arguments,
+        challenger_logits=challenger,
+        challenger_share=0.7,
+        input_gradient=lambda: torch.tensor(7.0),
+        input_gradient_weight=2.0,
+    )
     assert both.penalty == alone.penalty and both.cross_entropy == alone.cross_entropy
-    expected = 0.3 * alone.cross_entropy + 7.0 + weight * alone.penalty
+    theirs = discriminator.discriminator_loss(challenger, challenger, *arguments[2:]).cross_entropy
+    expected = 0.3 * alone.cross_entropy + 0.7 * theirs + 14.0 + weight * alone.penalty
     torch.testing.assert_close(both.total, expected / max(1.0, weight))
 
 
-def test_the_slopes_of_student_and_challenger_are_penalised_alike(demos, monkeypatch):
+def test_the_gradients_of_student_and_challenger_are_penalised_alike(demos, monkeypatch):
     """0.5 times the mean of 3 and 5 joins the loss."""
     risk = Minibatch(*(t[:1] for t in vars(a_batch(observations=8, actions=4)).values()))
     totals = []
@@ -114,7 +122,7 @@ def test_the_slopes_of_student_and_challenger_are_penalised_alike(demos, monkeyp
         slopes = iter((torch.tensor(3.0), torch.tensor(5.0)))
         monkeypatch.setattr(airl, "gradient_penalty", lambda *_, slopes=slopes: next(slopes))
         torch.manual_seed(0)
-        totals.append(learner._loss([risk, risk], 0.0, torch.Generator()).total.detach())
+        totals.append(learner._loss(risk, risk, 0.0, torch.Generator()).total.detach())
     torch.testing.assert_close(totals[1] - totals[0], torch.tensor(0.5 * 4.0))
 
 
@@ -276,11 +284,10 @@ def test_past_challengers_are_replayed_beside_the_present_one(demos, monkeypatch
         [stratum for strata in risks for stratum in strata] for risks in drawn[-2:]
     )
     for stratum in challenger:
-        (past,) = stratum.past
-        assert (stratum.policy.observations == 6.0).all() and (past.observations == 5.0).all()
+        assert (stratum.policy.observations == 6.0).all()
+        assert (stratum.past.observations == 5.0).all()
     for stratum in student:
-        (past,) = stratum.past
-        assert not (past.observations == 5.0).all(-1).any()
+        assert not (stratum.past.observations == 5.0).all(-1).any()
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
@@ -289,7 +296,7 @@ def test_the_share_of_challengers_is_taken_from_the_student(demos, share):
     challenger = replace(CHALLENGED["challenger"], share=share)
     _, learner, _ = challenged(demos, grouping="per-setting", challenger=challenger)
     student, challengers = (a_batch(size, observations=8, actions=4) for size in (6, 10))
-    total = learner._loss([student, challengers], 0.0, torch.Generator()).total
+    total = learner._loss(student, challengers, 0.0, torch.Generator()).total
     # Both settings weigh the same.
     own, other = (
         cross_entropy(discriminator.discriminator_logits(learner.model, batch, "f")[0]).mean()

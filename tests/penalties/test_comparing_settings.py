@@ -153,5 +153,5 @@ def test_l2_is_half_the_squared_size_of_all_weights():
 
 
 def test_input_gradient_is_the_slope_it_is_given():
-    seen = of_risks([1.0])._replace(slope=lambda: torch.tensor(2.5))
+    seen = of_risks([1.0])._replace(input_gradient=lambda: torch.tensor(2.5))
     assert discriminator_penalty("input-gradient")(seen, PLAIN).item() == 2.5
