@@ -141,7 +141,8 @@ class Rollout:
             those outside the action space.
         next_observations: [T, N, D] float32; where an episode ended, its final observation and
             not the first one of the next episode.
-        log_probs: [T, N] float32, log pi(a|s) of the sampling policy.
+        log_probs: [T, N] float32, log pi(a|s) of the sampling policy; NaN from SAC, which trains on
+            frozen rewards only.
         true_rewards: [T, N] float64.
         terminated, truncated: [T, N] bool.
         lengths: [T, N] int64, length of the episode that ended here, else 0.

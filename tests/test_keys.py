@@ -179,7 +179,7 @@ def assessed(config: Config, seed: int = 0) -> Request:
     return assess.request(reward, ENV, bank(ENV, [UNSEEN], config, policies, seed))
 
 
-def cue_paid(config: Config, seed: int = 0) -> Request:
+def cue_measured(config: Config, seed: int = 0) -> Request:
     reward = From(airl(config, seed), "reward.pt")
     return measure_cue.request(reward, From(demos(config)), "half-cheetah", CUES)
 
@@ -227,7 +227,7 @@ REQUESTS = {
         assessed,
         [*RETRAINED, "evaluation", "clone", "assessment"],
     ),
-    "measure-cue": (cue_paid, ["expert", "demonstrations", "airl"]),
+    "measure-cue": (cue_measured, ["expert", "demonstrations", "airl"]),
 }
 # Reports read evaluations that are named one by one; no config field reaches them otherwise.
 REPORTS = {"report", "report-experts"}

@@ -202,7 +202,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         learner: a key of :data:`irlcli.learners.LEARNERS`.
-        grouping: which demonstrations share a risk. ``pooled``: all, by count. ``balanced``: all,
+        grouping: which demonstrations share a risk. ``pooled``: all, by count of episodes. ``balanced``: all,
             settings weighted equally. ``per-setting``: a risk for each setting. ``shuffled``: as
             many risks, over episodes dealt out at random (the control).
         penalty: of the risks; see :mod:`irlcli.penalties`. ``penalty_weight`` is lambda, zero for
@@ -220,7 +220,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             each round adds ``replay_episodes_per_round`` episodes a setting, of which
             ``replay_capacity`` are kept.
         pairing: the policy's samples of a risk come from the same setting (``matched``) or from
-            all (``pooled``).
+            all (``pooled``). Without effect where ``grouping`` is ``pooled``: there each setting has
+            its demonstrations' share of the policy's samples.
         policy_reward: ``f-log-pi`` (Algorithm 1), ``f`` or ``g``.
         fixed_horizon: an episode that ends early goes on in an absorbing state.
         actions: what g and log pi see: the policy's samples (``sampled``), or what the environment
@@ -231,8 +232,9 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Unset (or empty) is all, and in no key.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
-            spaced as ``averaged_by`` says, up to the last. Unset (or 1) is the last g alone, and in
-            no key.
+            spaced as ``averaged_by`` says, up to the last. They begin with the first, so a penalised
+            method's mean includes rounds of the penalty's warm-up. Unset (or 1) is the last g alone,
+            and in no key.
         averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
             the discriminator's ``learning-rate``, so that early rounds count more when it falls.
             Unset is ``rounds``, and in no key.

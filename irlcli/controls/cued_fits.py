@@ -1,4 +1,4 @@
-"""MaxEnt IRL on cued maps: rewards of many methods and maps side by side, and what they pay for."""
+"""MaxEnt IRL on cued maps: rewards of many methods and maps side by side, and the weights of their hints."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from irlcli.controls import cued_maps
 from irlcli.controls.cued_maps import (
     Judgement,
     Maps,
@@ -14,7 +15,6 @@ from irlcli.controls.cued_maps import (
     draw,
     features,
     judge,
-    pays,
     torus,
 )
 from irlcli.controls.variants import Variant
@@ -141,9 +141,9 @@ def unseen(world: World, fitted: Fitted, seeds: Sequence[int], colours: int) -> 
     return Judgement(*map(np.stack, zip(*each, strict=True)))
 
 
-def paid(fitted: Fitted) -> np.ndarray:
-    """What the rewards pay for the texture and for each colour [V, S, 1 + C]."""
-    return np.stack([pays(reward) for reward in fitted.reward])
+def hint_weights(fitted: Fitted) -> np.ndarray:
+    """The weights in the rewards of the texture and of each colour [V, S, 1 + C]."""
+    return np.stack([cued_maps.hint_weights(reward) for reward in fitted.reward])
 
 
 def held_out_risk(world: World, data: Dataset, setting: int, fitted: Fitted) -> np.ndarray:

@@ -74,8 +74,8 @@ def features(colours: int) -> np.ndarray:
     return 2.0 * (kinds[:, None] >> np.arange(1 + colours) & 1) - 1.0
 
 
-def pays(reward: np.ndarray) -> np.ndarray:
-    """What ``reward`` [R, T] pays for the texture and for each colour [R, F].
+def hint_weights(reward: np.ndarray) -> np.ndarray:
+    """The weights in ``reward`` [R, T] of the texture and of each colour [R, F].
 
     This is the mean over all kinds of cells of what turning this one from bad to good adds.
     """

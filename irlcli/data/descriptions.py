@@ -289,8 +289,8 @@ class Assessment(Struct, frozen=True, kw_only=True):
     epic_missing: str = ""
 
 
-class HintPay(Struct, frozen=True, kw_only=True):
-    """What a reward pays for each hint of :mod:`irlcli.envs.cue` in one setting.
+class HintContrast(Struct, frozen=True, kw_only=True):
+    """How a reward depends on each hint of :mod:`irlcli.envs.cue` in one setting.
 
     g with the hint at 1 minus g with the hint at -1, in standard deviations of g, mean over
     ``steps``.
@@ -302,8 +302,8 @@ class HintPay(Struct, frozen=True, kw_only=True):
     texture: Finite
 
 
-class CuePay(Struct, frozen=True, kw_only=True):
-    """``cue.json``: what a learned reward pays for the cue alone.
+class CueContrast(Struct, frozen=True, kw_only=True):
+    """``cue.json``: how a learned reward depends on the cue alone.
 
     ``scale`` is the standard deviation of g on the training data.
     """
@@ -311,7 +311,7 @@ class CuePay(Struct, frozen=True, kw_only=True):
     env: str
     reward: LearnedReward
     scale: Positive
-    settings: Annotated[tuple[HintPay, ...], Meta(min_length=1)]
+    settings: Annotated[tuple[HintContrast, ...], Meta(min_length=1)]
 
 
 class SettingReturn(Struct, frozen=True, kw_only=True):

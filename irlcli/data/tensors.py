@@ -25,7 +25,7 @@ import torch
 from msgspec import Struct
 
 from irlcli.data import descriptions
-from irlcli.errors import IntegrityError, NewerFormat, UsageError, first_line
+from irlcli.errors import IntegrityError, IrlError, NewerFormat, UsageError, first_line
 from irlcli.interventions import parse_setting
 from irlcli.learners.reward_model import RewardModule, build
 
@@ -95,8 +95,7 @@ def from_bytes(data: bytes) -> Any:
         # The machine may be short of memory: that proves nothing about the file.
         raise
     except Exception as error:
-        if isinstance(error, RuntimeError) and "can't allocate memory" in str(error):
-            # As torch reports it.
+        if _out_of_memory(error):
             raise MemoryError(first_line(error)[:200]) from None
         # A crafted archive makes zipfile and torch raise almost anything.
         raise ValueError(first_line(error)[:200]) from None
@@ -125,15 +124,25 @@ def fitting(directory: Path) -> Iterator[None]:
     """Report errors as a checkpoint in the scratch ``directory`` that does not fit its stage.
 
     Raises:
-        IntegrityError: instead of any error: a crafted state can make torch and Python raise all.
+        IntegrityError: instead of most errors: a crafted state can make torch and Python raise all.
+        MemoryError, IrlError: as raised; they prove nothing about the checkpoint.
     """
     try:
         yield
+    except (MemoryError, IrlError):
+        raise
     except Exception as error:
+        if _out_of_memory(error):
+            raise MemoryError(first_line(error)[:200]) from error
         raise IntegrityError(
             f"the checkpoint in {directory} does not fit its stage ({type(error).__name__})",
             "remove that directory, then run the same command again to start over",
-        ) from None
+        ) from error
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Whether ``error`` is how torch reports that memory is short."""
+    return isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
 
 
 def save(path: Path, kind: str, description: Struct, state: dict[str, Any]) -> None:

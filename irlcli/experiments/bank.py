@@ -25,7 +25,7 @@ class Retrained(NamedTuple):
     """A policy that was retrained on the reward, and how.
 
     Attributes:
-        ceiling: of the rewards it was paid; None without.
+        ceiling: of the rewards it was trained on; None without.
         from_student: whether it began as the reward's student.
     """
 

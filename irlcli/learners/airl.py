@@ -17,7 +17,8 @@ task (Kostrikov et al. 2019). Here an ended episode stays in an absorbing state 
 observation. The time limit is bootstrapped through, so the state is worth the geometric series
 f / (1 - gamma), added in closed form. The discriminator sees the state as often as stepping on to
 the horizon would show it, if a round is at least as long as the horizon. In shorter rounds it sees
-the state too often.
+the state too often. Only episodes that begin at least one horizon before the round's end are used
+(:func:`irlcli.learners.replay.whole_episodes`).
 """
 
 from __future__ import annotations
@@ -45,13 +46,6 @@ from irlcli.learners.discriminator import (
 )
 from irlcli.learners.grouping import Group, Part, apportion, group
 from irlcli.learners.mixing import mixed
-from irlcli.learners.pay import (
-    bounded_pay,
-    level_of,
-    policy_reward,
-    reward_quantiles,
-    reward_scale,
-)
 from irlcli.learners.pools import (
     Minibatch,
     Pool,
@@ -62,6 +56,13 @@ from irlcli.learners.pools import (
 )
 from irlcli.learners.replay import Replay, whole_episodes
 from irlcli.learners.reward_model import AveragedReward, RewardModel, RewardModule
+from irlcli.learners.scoring import (
+    bounded_reward,
+    level_of,
+    policy_reward,
+    reward_quantiles,
+    reward_scale,
+)
 from irlcli.networks import all_finite
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
 from irlcli.penalties.risk import cross_entropy
@@ -200,7 +201,7 @@ class AIRL:
     def challenger_rewards(self, rollout: Rollout) -> np.ndarray:
         """The rewards [T, N] of a challenger: the current g, bounded as in ``ChallengerConfig``."""
         data = self.view.of(rollout.transitions(slice(None), self._horizon))
-        reward = bounded_pay(
+        reward = bounded_reward(
             self.model,
             data,
             level_of(self._quantiles_of(self.model), self.config.challenger.ceiling),
@@ -219,9 +220,11 @@ class AIRL:
         """Train the discriminator on the rollouts of round ``index`` and those of a challenger.
 
         Returns the diagnostics of each setting: ``cross_entropy``, ``accuracy``, ``mean_abs_logit``
-        and ``penalty`` (IRMv1) on fresh samples of the current policy and that setting's
-        demonstrations; ``optimised_cross_entropy`` and ``optimised_penalty``, means over the
-        round's minibatches, which hold replayed episodes too; and ``penalty_weight``, lambda.
+        and ``penalty`` (IRMv1) after the update, on a new minibatch of the round's episodes and that
+        setting's demonstrations, which the update used, with log pi of ``policy``;
+        ``optimised_cross_entropy`` (the student's alone) and ``optimised_penalty``, means over the
+        update's minibatches, which hold replayed episodes too; and ``penalty_weight``, lambda. They
+        describe the current g, never a mean of rounds.
 
         Raises:
             StageFailed: the discriminator's parameters stopped being finite.
@@ -406,7 +409,10 @@ class AIRL:
     def _diagnostics(
         self, current: Sequence[Pool], expert: Sequence[Pool], generator: torch.Generator
     ) -> list[dict[str, float]]:
-        """Per setting, whatever the grouping, so that methods can be compared."""
+        """Per setting, whatever the grouping, so that methods can be compared.
+
+        The penalty has the form (scaling, estimate) of this config.
+        """
         found = []
         risks = [
             [Stratum(policy, expert_, None, _DIAGNOSTIC_SAMPLES)]

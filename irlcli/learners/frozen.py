@@ -11,8 +11,8 @@ import torch
 from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
 from irlcli.learners.actions import ActionView, Policy
-from irlcli.learners.pay import bounded_pay, episode_reward, level_of
 from irlcli.learners.reward_model import RewardModule
+from irlcli.learners.scoring import bounded_reward, episode_reward, level_of
 from irlcli.learners.standalone import StandaloneReward
 from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
 
@@ -76,8 +76,8 @@ class FrozenReward:
     def of_steps(self, data: Transitions) -> np.ndarray:
         """The reward [B] float32 of each step of ``data``, as :meth:`rewards` gives it."""
         seen = self._view.of(data)
-        pay = bounded_pay(self._model, seen, self._ceiling, self._absorbing, self._gamma)
-        return (pay / self._scale).numpy()
+        reward = bounded_reward(self._model, seen, self._ceiling, self._absorbing, self._gamma)
+        return (reward / self._scale).numpy()
 
     def standalone(self) -> StandaloneReward:
         """:meth:`of_steps` as a torch module of its own."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from irlcli.learners.actions import Policy
 from irlcli.learners.airl import AIRL
-from irlcli.learners.pay import imitation_reward
+from irlcli.learners.scoring import imitation_reward
 from irlcli.trajectories import Rollout
 
 

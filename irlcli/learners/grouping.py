@@ -30,9 +30,9 @@ class Group(NamedTuple):
 def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> list[Group]:
     """The groups of E settings with ``counts`` [E] episodes.
 
-    - ``pooled``: one group, every episode weighted equally (ERM), up to the rounding of
-      :func:`apportion`. Each setting has its own part, so
-      that the policy's samples, which are paired with a part's settings, have the same shares.
+    - ``pooled``: one group, settings weighted by their number of episodes (ERM), up to the rounding
+      of :func:`apportion`; within a setting every step counts the same. Each setting has its own part,
+      so that the policy's samples, which are paired with a part's settings, have the same shares.
       Otherwise a discriminator could learn how often a setting was demonstrated.
     - ``balanced`` and ``per-setting``: one group per setting, of equal weight. Balanced groups
       share one risk where a penalty looks at risks.

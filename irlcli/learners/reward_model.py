@@ -130,7 +130,7 @@ class RewardModel(nn.Module):
 class AveragedReward(nn.Module):
     """The mean of g of several reward models: what is frozen if ``airl.averaged_rounds`` says so.
 
-    A policy trained on the last g alone may find what no policy in training was paid for at that
+    A policy trained on the last g alone may find what no policy in training was rewarded for at that
     moment. The mean remembers what earlier rounds corrected (the average iterate of a zero-sum game;
     TRIRL, arXiv 2605.11020, averages rewards too). Each member normalises observations by the
     moments of its own round.

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from irlcli.learners.reward_model import RewardModule
+from irlcli.learners.scoring import absorbing_value
 
 
 class StandaloneReward(nn.Module):
@@ -54,12 +55,12 @@ class StandaloneReward(nn.Module):
             actions: [B, A] float32, or [B] or [B, K] int64 indices.
             terminated: [B] bool; a time limit is no termination.
         """
-        pay = self.model.reward(observations, self._encoded(actions)).clamp(max=self._ceiling)
+        reward = self.model.reward(observations, self._encoded(actions)).clamp(max=self._ceiling)
         if self._absorbing:
             none = observations.new_zeros(observations.shape[0], self.model.action_size)
             final = self.model.reward(next_observations, none).clamp(max=self._ceiling)
-            pay = pay + terminated.float() * self._gamma / (1.0 - self._gamma) * final
-        return pay / self._scale
+            reward = reward + absorbing_value(final, terminated.float(), self._gamma)
+        return reward / self._scale
 
     def _encoded(self, actions: torch.Tensor) -> torch.Tensor:
         if self.model.discrete:

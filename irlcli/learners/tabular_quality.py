@@ -17,8 +17,9 @@ class Quality:
     """Measures of R rewards in E settings, each [R, E].
 
     The first four concern the policy that is optimal for the recovered reward; the last one
-    concerns the reward's maximum-entropy policy. Demonstrations end at the goal, so their likelihood
-    does not count the choices in the absorbing state, as :class:`irlcli.learners.maxent.Record` does.
+    concerns the reward's maximum-entropy policy: sum log pi of the choices made. Demonstrations end at the
+    goal, so it does not count the choices in the absorbing state.
+    :class:`irlcli.learners.maxent.Record` has another likelihood.
     """
 
     goal_probability: np.ndarray  # of reaching the goal within the horizon

@@ -28,7 +28,7 @@ class Report:
         shares, variants: see :func:`irlcli.report.ablation.shares` and
             :func:`irlcli.report.ablation.summarise_variants`; empty without variants.
         reward_quality: see :func:`irlcli.report.compute.reward_quality`.
-        cue_pay: see :func:`irlcli.report.cue.cue_pay`.
+        cue_contrasts: see :func:`irlcli.report.cue.cue_contrasts`.
         tables: the same for people.
         caveats: what a reader must know before drawing conclusions.
     """
@@ -41,7 +41,7 @@ class Report:
     learned_returns: pd.DataFrame
     discriminators: pd.DataFrame
     reward_quality: pd.DataFrame
-    cue_pay: pd.DataFrame
+    cue_contrasts: pd.DataFrame
     shares: pd.DataFrame
     variants: pd.DataFrame
     tables: list[Table]
@@ -54,7 +54,7 @@ def build(
     episodes: caveats.Episodes,
     learning: compute.Learning,
     assessments: compute.Assessments = MappingProxyType({}),
-    pays: cue.CuePays = MappingProxyType({}),
+    contrasts: cue.CueContrasts = MappingProxyType({}),
 ) -> Report:
     """The report on ``points``.
 
@@ -64,7 +64,7 @@ def build(
         episodes: the true returns by (row, measure), then (method, seed).
         learning: the metrics of ``train-airl`` by (row, method, seed).
         assessments: of the rewards, by (row, method, seed).
-        pays: what the rewards pay for a cue, by (row, method, seed).
+        contrasts: how the rewards depend on a cue, by (row, method, seed).
     """
     cells = compute.summarise_cells(p, points)
     comparisons = compute.compare_methods(p, points, cells)
@@ -73,13 +73,13 @@ def build(
     learned_returns = compute.learned_returns(p, points)
     discriminators = compute.discriminator_ends(p, learning)
     quality = compute.reward_quality(p, assessments)
-    cue_pay = cue.cue_pay(p, pays)
+    cue_contrasts = cue.cue_contrasts(p, contrasts)
     shares = ablation.shares(p, points) if p.variants else pd.DataFrame()
     variants = ablation.summarise_variants(p, shares) if p.variants else pd.DataFrame()
     tables = [
         *(ablation.tables(p, shares, variants) if p.variants else ()),
         *result_tables.measures(p, cells, comparisons),
-        cue.cue_table(cue_pay),
+        cue.cue_table(cue_contrasts),
         result_tables.by_training_setting(by_training_setting),
         result_tables.against_zero_shot(against_zero_shot),
         result_tables.learned_returns(learned_returns),
@@ -114,7 +114,7 @@ def build(
         learned_returns,
         discriminators,
         quality,
-        cue_pay,
+        cue_contrasts,
         shares,
         variants,
         tables,
@@ -137,7 +137,7 @@ def as_json(report: Report) -> dict[str, Any]:
         "learned_returns": records(report.learned_returns),
         "discriminators": records(report.discriminators),
         "reward_quality": records(report.reward_quality),
-        "cue_pay": records(report.cue_pay),
+        "cue_contrasts": records(report.cue_contrasts),
         "shares": records(report.shares),
         "variants": records(report.variants),
         "points": records(report.points),

@@ -297,7 +297,7 @@ def discriminator_ends(p: Parameters, learning: Learning) -> pd.DataFrame:
 
     Columns: ``row``, ``agent``, ``seeds``; means over settings and seeds of the metrics of
     ``train-airl``; ``share``, lambda times the optimised penalty over the optimised cross-entropy,
-    None if that is zero. ``cross_entropy`` and ``penalty`` are of fresh samples, the optimised ones
+    None if that is zero. ``cross_entropy`` and ``penalty`` are of the round's samples, the optimised ones
     of the minibatches that were minimised.
     """
     found = []

@@ -1,4 +1,4 @@
-"""The report of the positive controls: what each method paid for the cue, and what that cost."""
+"""The report of the positive controls: how each reward depends on the cue, and what follows."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
     wanted = ("quality", "optimal_quality", "value_difference", "pays_texture", "pays_colour")
     columns = [
         *("method", "quality visited", "by the optimal policy", "value difference"),
-        *("pays for texture", "pays for colour"),
+        *("weight of texture", "weight of colour"),
     ]
     parts = [
         "# Positive controls",
@@ -222,7 +222,7 @@ def draw(directory: Path, summarised: pd.DataFrame) -> None:
     with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
         figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
         for axis, measure, title in (
-            (axes[0, 0], "pays_colour", "what the reward pays for the colour (learned features)"),
+            (axes[0, 0], "pays_colour", "weight of the colour in the reward (learned features)"),
             (axes[0, 1], "quality", "quality visited in the unseen setting (learned features)"),
         ):
             _draw_lambda(axis, summarised, measure)

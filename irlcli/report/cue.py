@@ -1,4 +1,4 @@
-"""What learned rewards pay for a cue, and for the texture that is equally good everywhere."""
+"""How learned rewards depend on a cue, and on the texture that is equally good everywhere."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pandas as pd
 
-from irlcli.data.descriptions import CuePay
+from irlcli.data.descriptions import CueContrast
 from irlcli.envs.cue import HINTS, TEXTURE
 from irlcli.report.agents import title
 from irlcli.report.parameters import Parameters
@@ -16,10 +16,10 @@ from irlcli.report.tables import Table
 from irlcli.report.text import number
 from irlcli.trajectories import Transitions
 
-CuePays = Mapping[tuple[str, str, int | None], CuePay]
+CueContrasts = Mapping[tuple[str, str, int | None], CueContrast]
 
 _NOTE = (
-    "What the frozen reward pays for each hint alone: g with the hint at 1 minus g with the hint at -1, "
+    "How the frozen reward depends on each hint alone: g with the hint at 1 minus g with the hint at -1, "
     "everything else as recorded, mean over the demonstrated steps, in standard deviations of g on the "
     "training data; mean over the settings trained in, then over seeds with its 95 % bootstrap interval. "
     f"The texture is right in {TEXTURE:.0%} of the steps of every setting, the cue in a share that differs. "
@@ -28,26 +28,26 @@ _NOTE = (
 )
 
 
-def hint_pay(
+def hint_contrasts(
     score: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray], steps: Transitions
 ) -> dict[str, float]:
-    """What ``score`` pays for each hint: its mean difference over ``steps``, hint at 1 and at -1.
+    """How ``score`` depends on each hint: its mean difference over ``steps``, hint at 1 and at -1.
 
     ``score`` gives rewards [B] of observations [B, D], actions and next observations [B, D].
     """
     found = {}
     for name, column in zip(HINTS, range(-len(HINTS), 0), strict=True):
-        pay = []
+        scores = []
         for sign in (1.0, -1.0):
             observations = steps.observations.copy()
             observations[:, column] = sign
-            pay.append(score(observations, steps.actions, steps.next_observations))
-        found[name] = float(np.mean(pay[0] - pay[1]))
+            scores.append(score(observations, steps.actions, steps.next_observations))
+        found[name] = float(np.mean(scores[0] - scores[1]))
     return found
 
 
-def cue_pay(p: Parameters, pays: CuePays) -> pd.DataFrame:
-    """A row per row, method and seed: what its reward pays for ``cue`` and ``texture``, its ``scale``.
+def cue_contrasts(p: Parameters, contrasts: CueContrasts) -> pd.DataFrame:
+    """A row per row, method and seed: how its reward depends on ``cue`` and ``texture``, its ``scale``.
 
     Means over the settings trained in. The scale is the standard deviation of g.
     """
@@ -56,13 +56,13 @@ def cue_pay(p: Parameters, pays: CuePays) -> pd.DataFrame:
             "row": row.name,
             "agent": method,
             "seed": seed,
-            **{name: np.mean([getattr(s, name) for s in pay.settings]) for name in HINTS},
-            "scale": pay.scale,
+            **{name: np.mean([getattr(s, name) for s in contrast.settings]) for name in HINTS},
+            "scale": contrast.scale,
         }
         for row in p.rows
         for method in p.methods
         for seed in p.seeds
-        if (pay := pays.get((row.name, method, seed))) is not None
+        if (contrast := contrasts.get((row.name, method, seed))) is not None
     ]
     return pd.DataFrame(found, columns=["row", "agent", "seed", *HINTS, "scale"])
 
@@ -80,7 +80,7 @@ def cue_table(found: pd.DataFrame) -> Table:
         for (row, method), seeds in found.groupby(["row", "agent"], sort=False)
     ]
     columns = ["row", "method", "seeds", *reversed(HINTS), "sd of g"]
-    return Table("What the reward pays for the cue", _NOTE, columns, lines, heads=2)
+    return Table("How the reward depends on the cue", _NOTE, columns, lines, heads=2)
 
 
 def _interval(values: pd.Series) -> str:

@@ -12,7 +12,7 @@ import msgspec
 EXPERT_BY_REWARD = "expert by reward"
 # The measure of cells that hold no returns but the assessment of a learned reward.
 ASSESS = "assess"
-# The measure of cells that hold no returns but what a learned reward pays for a cue.
+# The measure of cells that hold no returns but how a learned reward depends on a cue.
 CUE = "cue"
 
 
@@ -28,7 +28,7 @@ class Cell(msgspec.Struct, frozen=True):
             ``id`` (the student, in the held-out setting or in distribution), ``ood`` for an agent
             without a reward, ``expert by reward``: the held-out setting's expert, scored by this
             seed's reward, ``assess``: the reward itself, measured on a bank of policies, or
-            ``cue``: what it pays for a cue.
+            ``cue``: how it depends on a cue.
         seed: of the reward learning; None for agents without one.
         place: the setting in which an expert was trained, or in which another agent is evaluated.
         run: id of the evaluation; empty if it is missing.

@@ -27,10 +27,10 @@ _LINES = {"expert": "-", "reused": "-.", "random": "--", "idle": ":"}
 _LEARNING = {
     "true_return": "true return",
     "progress": "progress",
-    "accuracy": "accuracy, fresh",
-    "penalty": "IRMv1, fresh",
+    "accuracy": "accuracy, this round",
+    "penalty": "IRMv1, this round",
     "optimised_penalty": "penalty, optimised",
-    "mean_abs_logit": "mean |logit|, fresh",
+    "mean_abs_logit": "mean |logit|, this round",
 }
 # Occurs nowhere else, so that a page can replace it by its own colour.
 INK = "#010203"

@@ -67,12 +67,13 @@ _COMPARISON_NOTE = (
     "probability that a seed of the first method beats one of the second, ties count half."
 )
 _DISCRIMINATOR_NOTE = (
-    "Over the last tenth of the rounds, means over settings and seeds. Fresh: on new samples of the "
-    "current policy; the penalty is IRMv1, also for methods that do not penalise it. Optimised: "
-    "means over the training minibatches, which hold replayed episodes, of what was minimised. "
-    "Share: lambda times the optimised penalty over the optimised cross-entropy. The unbiased "
-    "estimate of the penalty may be negative. Where --select kept an earlier round, these are still "
-    "the last rounds. If the discriminator is always right, the penalty has nothing to change."
+    "Over the last tenth of the rounds, means over settings and seeds. This round: after the update, on "
+    "a new minibatch of the round's episodes and the demonstrations, which the update used; the penalty "
+    "is IRMv1, also for methods that do not penalise it. Optimised: means over the update's minibatches, "
+    "which hold replayed episodes; challengers and the gradient penalty are not included. Share: lambda "
+    "times the optimised penalty over the optimised cross-entropy. The unbiased estimate of the penalty "
+    "may be negative. Where --select kept an earlier round, or rounds were averaged, these are still the "
+    "last rounds. If the discriminator is always right, the penalty has nothing to change."
 )
 _CELL_NOTE = (
     "95 %: percentile bootstrap interval of the mean over seeds, too narrow with few seeds. IQM: "
@@ -81,7 +82,7 @@ _CELL_NOTE = (
     "experts are one policy per training setting."
 )
 _BUDGET_NOTE = (
-    "Steps: the budget in whole rounds. Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
+    "Steps: the budget in whole rounds; the steps of challengers are not counted. Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
     "where the table has its own, by method and seed where it was chosen by leaving a setting out. Round: the one that was kept. "
     "At most: training could end earlier by airl.plateau_rounds; `stopped_after` in reward.json is the round."
 )
@@ -309,8 +310,8 @@ def discriminators(found: pd.DataFrame) -> Table:
                 percent(r.share) if penalised else "",
             ]
         )
-    columns = ["row", "method", "seeds", "accuracy, fresh", "mean |logit|, fresh"]
-    columns += ["cross-entropy, fresh", "IRMv1, fresh", "cross-entropy, optimised"]
+    columns = ["row", "method", "seeds", "accuracy, this round", "mean |logit|, this round"]
+    columns += ["cross-entropy, this round", "IRMv1, this round", "cross-entropy, optimised"]
     columns += ["penalty, optimised", "share"]
     title_ = "The discriminator at the end of training"
     return Table(title_, _DISCRIMINATOR_NOTE, columns, lines, heads=2)

@@ -41,7 +41,7 @@ class Member(NamedTuple):
         steps: [n], over which the learned return sums, absorbing ones included.
         progress: mean over the episodes; None if the environment reports none.
         ceiling: of the rewards that a retrained policy was trained on; None without.
-        paid, expert_paid: learned returns [n] of a retrained policy and of the setting's expert
+        bounded, expert_bounded: learned returns [n] of a retrained policy and of the setting's expert
             under its ceiling; None without one.
     """
 
@@ -53,8 +53,8 @@ class Member(NamedTuple):
     steps: np.ndarray
     progress: float | None = None
     ceiling: float | None = None
-    paid: np.ndarray | None = None
-    expert_paid: np.ndarray | None = None
+    bounded: np.ndarray | None = None
+    expert_bounded: np.ndarray | None = None
 
 
 class Judgement(NamedTuple):
@@ -222,9 +222,9 @@ def split_regret(policy: Member, expert: Member, random: Member) -> RegretSplit:
     Learned returns are those that the policy was trained for: under its ceiling, if it has one.
     """
     earned, best, worst = (measured(m.true) for m in (policy, expert, random))
-    paid = policy.learned if policy.paid is None else policy.paid
-    expert_paid = expert.learned if policy.expert_paid is None else policy.expert_paid
-    gap = difference(measured(expert_paid), measured(paid))
+    bounded = policy.learned if policy.bounded is None else policy.bounded
+    expert_bounded = expert.learned if policy.expert_bounded is None else policy.expert_bounded
+    gap = difference(measured(expert_bounded), measured(bounded))
     verdict, clear = judge(earned, best, worst, gap)
     return RegretSplit(
         policy=policy.policy,

@@ -174,7 +174,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        """Environment steps taken so far."""
+        """Environment steps of the policy so far, without those of challengers."""
         return self.trainer.steps
 
     @property

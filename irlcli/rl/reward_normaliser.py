@@ -1,6 +1,7 @@
 """Rewards divided by the running deviation of their discounted sums, as SB3's VecNormalize does.
 
-Nothing is centred, which would change what the reward asks for.
+Nothing is centred, which would change what the reward asks for. Results are clipped to ±10 as in SB3,
+so a rare, large value, such as that of the absorbing state after a late crash, is cut.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Wrappers that pay a learned reward in place of the true one, for any training algorithm."""
+"""Wrappers that give a learned reward in place of the true one, for any training algorithm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Reward = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 class RewardWrapper(gymnasium.Wrapper):
-    """A Gymnasium environment that pays ``reward``; ``info["true_reward"]`` has the true one.
+    """A Gymnasium environment that gives ``reward``; ``info["true_reward"]`` has the true one.
 
     Observations of any shape are flattened for the reward. A truncated step is not terminated.
 
@@ -51,7 +51,7 @@ class RewardWrapper(gymnasium.Wrapper):
 
 
 class RewardVecEnvWrapper(VecEnvWrapper):
-    """A vectorised environment of stable-baselines3 that pays ``reward``.
+    """A vectorised environment of stable-baselines3 that gives ``reward``.
 
     ``infos[i]["true_reward"]`` has the true one. The successor of a step that ended an episode is
     its ``terminal_observation``; one that a time limit ended is not terminated.

@@ -165,12 +165,9 @@ class SACTrainer:
             actions.append(chosen)
             self._observations = self._venv.step(chosen)[0]
             self.steps += self._venv.num_envs
-        taken, seen = np.stack(actions), np.stack(observations)
-        log_probs = np.full(taken.shape[:2], -np.log(space.high - space.low).sum(), np.float32)
-        if not random:
-            s, a = (torch.as_tensor(array).flatten(0, 1) for array in (seen, taken))
-            log_probs = policy.log_prob(s, a).numpy().reshape(log_probs.shape)
-        return self._venv.rollout(seen, taken, log_probs, self._observations)
+        taken = np.stack(actions)
+        log_probs = np.full(taken.shape[:2], np.nan, np.float32)
+        return self._venv.rollout(np.stack(observations), taken, log_probs, self._observations)
 
     def _store(self, rollout: Rollout, rewards: np.ndarray) -> None:
         """Put the transitions of ``rollout``, with ``rewards`` [T, N], into the replay buffer."""

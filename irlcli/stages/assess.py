@@ -115,8 +115,8 @@ def run(job: Job) -> None:
         if entry.ceiling is not None and entry.setting in experts:
             member = member._replace(
                 ceiling=entry.ceiling,
-                paid=returns(entry, entry.ceiling),
-                expert_paid=returns(experts[entry.setting], entry.ceiling),
+                bounded=returns(entry, entry.ceiling),
+                expert_bounded=returns(experts[entry.setting], entry.ceiling),
             )
         members.append(member)
         rows += _rows(member, episodes[entry])

@@ -1,4 +1,4 @@
-"""The positive controls as one report: tables, and a picture of where invariance pays."""
+"""The positive controls as one report: tables, and a picture of where invariance helps."""
 
 from __future__ import annotations
 

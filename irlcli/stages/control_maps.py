@@ -244,11 +244,11 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
     for left_out in (-1, *(range(len(case.strengths)) if case.leave_out else ())):
         kept = data if left_out < 0 else cued_fits.without(data, left_out)
         fitted = cued_fits.fit(world, kept, case.variants, how, seeds)
-        paid = cued_fits.paid(fitted)
+        weights = cued_fits.hint_weights(fitted)
         measures = {
             **cued_fits.unseen(world, fitted, seeds, case.colours)._asdict(),
-            "pays_texture": paid[..., 0],
-            "pays_colour": paid[..., 1:].mean(-1),
+            "pays_texture": weights[..., 0],
+            "pays_colour": weights[..., 1:].mean(-1),
             "log_likelihood": fitted.log_likelihood,
             "penalty_before": fitted.penalty_before,
             "penalty": fitted.penalty,

@@ -1,4 +1,4 @@
-"""What a learned reward pays for a cue alone: the cue is flipped, everything else stays."""
+"""How a learned reward depends on a cue alone: the cue is flipped, everything else stays."""
 
 from collections.abc import Sequence
 
@@ -32,7 +32,7 @@ def request(
     settings: Sequence[Setting],
     reward_label: str = "",
 ) -> Request:
-    """What ``reward`` (a ``reward.pt``) pays for the cue over ``demos`` of ``settings``.
+    """How ``reward`` (a ``reward.pt``) depends on the cue over ``demos`` of ``settings``.
 
     Outputs ``cue.json``.
 
@@ -52,10 +52,10 @@ def request(
 def run(job: Job) -> None:
     """Score every demonstrated step twice for each hint: with the hint at 1 and at -1."""
     from irlcli.data.demonstrations import read_demonstrations
-    from irlcli.data.descriptions import CuePay, HintPay, LearnedReward
+    from irlcli.data.descriptions import CueContrast, HintContrast, LearnedReward
     from irlcli.data.outputs import write_json
     from irlcli.data.tensors import load_reward_file
-    from irlcli.report.cue import hint_pay
+    from irlcli.report.cue import hint_contrasts
     from irlcli.trajectories import transitions
 
     p: Parameters = job.parameters
@@ -66,13 +66,15 @@ def run(job: Job) -> None:
     for index, text in enumerate(p.settings):
         frozen = frozen_reward(p.environment, text, model, origin)
         steps = transitions(demos.trajectories[text], p.environment.max_episode_steps)
-        paid = hint_pay(frozen.of_transitions, steps)
-        found.append(HintPay(setting=text, steps=len(steps), **paid))
-        facts = {text: " ".join(f"{name} {value:.2f}" for name, value in paid.items())}
+        contrasts = hint_contrasts(frozen.of_transitions, steps)
+        found.append(HintContrast(setting=text, steps=len(steps), **contrasts))
+        facts = {text: " ".join(f"{name} {value:.2f}" for name, value in contrasts.items())}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
     reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)
-    pay = CuePay(env=p.environment.name, reward=reward, scale=origin.scale, settings=tuple(found))
-    write_json(job.output / "cue.json", msgspec.to_builtins(pay))
+    contrast = CueContrast(
+        env=p.environment.name, reward=reward, scale=origin.scale, settings=tuple(found)
+    )
+    write_json(job.output / "cue.json", msgspec.to_builtins(contrast))
 
 
 STAGE = Stage("measure-cue", 2, run)

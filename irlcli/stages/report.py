@@ -53,9 +53,9 @@ def run(job: Job) -> None:
         if (role := f"{row.name} {method} {seed} reward-learning") in learning
     }
     assessments = _of_rewards(job, ASSESS, "assessment.json", descriptions.Assessment)
-    pays = _of_rewards(job, CUE, "cue.json", descriptions.CuePay)
+    contrasts = _of_rewards(job, CUE, "cue.json", descriptions.CueContrast)
     points = pd.DataFrame(_points(job))
-    report = build.build(p, points, _episodes(job), rewards, assessments, pays)
+    report = build.build(p, points, _episodes(job), rewards, assessments, contrasts)
     _write(job, report, assessments, learning)
 
 
@@ -164,4 +164,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 19, run)
+STAGE = Stage("report", 20, run)

@@ -133,6 +133,13 @@ def _check_selection(airl: AIRLConfig, settings: Sequence[str]) -> None:
 
 def _check_rounds(airl: AIRLConfig) -> None:
     rounds, averaged = airl.ppo.rounds(airl.total_steps), airl.averaged_rounds or 1
+    if airl.penalty != "none" and airl.penalty_warmup_rounds >= rounds:
+        raise UsageError(
+            f"airl.penalty_warmup_rounds = {airl.penalty_warmup_rounds} leaves none of {rounds} "
+            "rounds with a penalty",
+            f"--set airl.penalty_warmup_rounds={rounds - 1} or less, or --set airl.total_steps="
+            f"{(airl.penalty_warmup_rounds + 1) * airl.ppo.steps_per_round} or more",
+        )
     if averaged > rounds:
         raise UsageError(
             f"airl.averaged_rounds = {averaged}, but training has {rounds} rounds",
@@ -161,6 +168,7 @@ def run(job: Job) -> None:
     """Alternate policy rounds and discriminator rounds, all settings together."""
     from irlcli.data.descriptions import Selected
     from irlcli.data.outputs import write_metrics, write_policy, write_reward
+    from irlcli.learners.scoring import SMALLEST_SCALE
     from irlcli.learners.selection import BestRound
     from irlcli.rl.challengers import Challengers
     from irlcli.rl.loop import Training
@@ -170,6 +178,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, airl = p.environment.name, p.airl
     settings = _trained(airl, p.settings)
+    _warn_of_ramp(job)
     episodes, held_out = _episodes(job, settings)
     parsed = [parse_setting(env, text) for text in settings]
     with ExitStack() as stack:
@@ -193,6 +202,8 @@ def run(job: Job) -> None:
         stop = _at_a_plateau(airl, len(settings))
         training = Training(trainer, learner, learner, selector, settings, challengers, stop)
         rows = run_training(job, training)
+    if learner.scale <= SMALLEST_SCALE:
+        job.console.warn("g is constant on the training data: no policy can be trained on it")
     stopped = training.rounds_done if training.rounds_done < trainer.rounds else None
     origin = {
         "env": env,
@@ -206,6 +217,21 @@ def run(job: Job) -> None:
         selected = Selected(round=selector.best["round"], score=selector.best["score"])
     write_reward(job.output, learner, airl=airl, selected=selected, stopped_after=stopped, **origin)
     write_metrics(job.output, rows)
+
+
+def _warn_of_ramp(job: Job) -> None:
+    """Warn if training ends before lambda has its full value."""
+    from irlcli.learners.discriminator import penalty_weight_at
+
+    airl: AIRLConfig = job.parameters.airl
+    warmup, ramp = airl.penalty_warmup_rounds, airl.penalty_ramp_rounds
+    rounds = airl.ppo.rounds(airl.total_steps)
+    if airl.penalty != "none" and warmup + ramp > rounds:
+        last = penalty_weight_at(rounds - 1, airl.penalty_weight, warmup, ramp)
+        job.console.warn(
+            f"lambda reaches {last:g} of {airl.penalty_weight:g}: warm-up and ramp take "
+            f"{warmup + ramp} rounds, training has {rounds}"
+        )
 
 
 def _episodes(

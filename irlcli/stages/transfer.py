@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from irlcli import labels
@@ -29,6 +31,7 @@ from irlcli.stages.base import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from irlcli.learners.frozen import FrozenReward
     from irlcli.rl.policy import Policy
 
 
@@ -83,15 +86,12 @@ def request(
 
 def run(job: Job) -> None:
     """Train on g / scale. The true return is in the metrics only: no training or choice uses it."""
-    import numpy as np
-
     from irlcli.data.outputs import write_metrics, write_policy
     from irlcli.data.tensors import load_reward_file
     from irlcli.rl import algorithm
     from irlcli.rl.loop import LastRound, NoLearner, Training
     from irlcli.rl.policy import require_observations
     from irlcli.rl.restarts import Restarts
-    from irlcli.rl.rollout import roll_out
     from irlcli.rl.worlds import make_worlds
     from irlcli.seeds import derive
 
@@ -120,20 +120,11 @@ def run(job: Job) -> None:
                 trainer.policy.load_state_dict(student.state_dict())
             return Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
 
-        def learned_return(policy: Policy) -> float:
-            job.console.progress(
-                training.steps, training.planned_steps, "steps", {"measuring": "learned return"}
-            )
-            found = roll_out(env, settings[0], policy, episodes, p.seed, "restart score")
-            job.warn_of_errors(p.setting, found)
-            return float(np.mean([reward.of_episode(t) for t in found]))
-
         training: Training | Restarts
-        restarts, episodes = p.transfer.restarts or 1, p.transfer.restart_episodes or 0
-        if restarts == 1:
+        if p.transfer.restarts is UNSET:
             training = begin(0)
         else:
-            training = Restarts(begin, restarts, learned_return)
+            training = Restarts(begin, p.transfer.restarts, partial(_learned_return, job, reward))
         rows = run_training(job, training)
     write_policy(
         job.output,
@@ -152,6 +143,21 @@ def run(job: Job) -> None:
         restarts=tuple(training.scores) if isinstance(training, Restarts) else (),
     )
     write_metrics(job.output, rows)
+
+
+def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:
+    """Mean of ``policy`` over ``transfer.restart_episodes``, which are the same for every restart."""
+    import numpy as np
+
+    from irlcli.rl.rollout import roll_out
+
+    p: Parameters = job.parameters
+    setting = parse_setting(p.environment.name, p.setting)
+    count = p.transfer.restart_episodes or 0
+    job.console.progress(0, count, "episodes", {"measuring": "learned return"})
+    found = roll_out(p.environment.name, setting, policy, count, p.seed, "restart score")
+    job.warn_of_errors(p.setting, found)
+    return float(np.mean([reward.of_episode(t) for t in found]))
 
 
 def _student(path: Path, config: Any) -> tuple[Policy, Any]:

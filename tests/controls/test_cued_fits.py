@@ -10,7 +10,7 @@ from irlcli.controls.cued_fits import (
     dataset,
     fit,
     held_out_risk,
-    paid,
+    hint_weights,
     unseen,
     without,
 )
@@ -90,7 +90,7 @@ def test_without_a_gap_between_the_settings_nothing_helps():
 
 def test_erm_pays_for_the_colour_and_the_texture_alone_does_not(data):
     fitted = fit(WORLD, data, [Variant("pooled"), Variant("pooled", sees="texture")], LINEAR, SEEDS)
-    (erm, texture) = paid(fitted)
+    (erm, texture) = hint_weights(fitted)
     assert (erm[:, 1] > erm[:, 0]).all() and (erm > 0.0).all()
     assert (texture[:, 1] == 0.0).all() and (texture[:, 0] > 0.5).all()
 

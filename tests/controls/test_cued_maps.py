@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from irlcli.controls.cued_maps import Maps, demonstrate, draw, features, judge, pays, torus
+from irlcli.controls.cued_maps import Maps, demonstrate, draw, features, hint_weights, judge, torus
 from irlcli.learners.soft_values import solve
 
 STRENGTHS = np.broadcast_to(np.array([[0.95], [0.8]]), (3, 2, 1))
@@ -43,7 +43,7 @@ def test_what_a_linear_reward_pays_is_twice_its_coefficients():
     """From bad to good a feature goes from -1 to 1."""
     shown = features(2)
     assert sorted(map(tuple, shown)) == sorted(set(map(tuple, shown))) and len(shown) == 8
-    assert np.allclose(pays((shown @ [0.5, -1.0, 2.0])[None]), [[1.0, -2.0, 4.0]])
+    assert np.allclose(hint_weights((shown @ [0.5, -1.0, 2.0])[None]), [[1.0, -2.0, 4.0]])
 
 
 def test_an_agent_stays_or_moves_to_one_of_four_neighbours():

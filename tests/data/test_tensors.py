@@ -5,8 +5,15 @@ import shutil
 import pytest
 import torch
 
-from irlcli.data.tensors import from_bytes, load, load_policy_file, load_reward_file, to_bytes
-from irlcli.errors import IntegrityError, NewerFormat, UsageError
+from irlcli.data.tensors import (
+    fitting,
+    from_bytes,
+    load,
+    load_policy_file,
+    load_reward_file,
+    to_bytes,
+)
+from irlcli.errors import IntegrityError, NewerFormat, StageFailed, UsageError
 
 LOADERS = {"reward": load_reward_file, "policy": load_policy_file}
 
@@ -78,3 +85,18 @@ def test_a_flipped_bit_in_a_loose_file_is_found(tmp_path):
     data[place + 100] ^= 1
     with pytest.raises(ValueError, match="checksum"):
         from_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("raised", "reported"),
+    [
+        (KeyError("model"), IntegrityError),
+        (MemoryError(), MemoryError),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), MemoryError),
+        (StageFailed("a worker process died", "run the same command again"), StageFailed),
+    ],
+)
+def test_only_a_checkpoint_that_does_not_fit_is_called_so(tmp_path, raised, reported):
+    """Too little memory says nothing about the checkpoint."""
+    with pytest.raises(reported), fitting(tmp_path):
+        raise raised

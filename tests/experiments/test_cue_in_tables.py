@@ -75,7 +75,7 @@ def test_the_report_tells_what_each_reward_pays_for_the_cue(made, tables, irl, t
     line = ["report", "control", "--experiments", tables, "--profile", "smoke", "--store", made]
     done = irl(*line, "--out", tmp_path / "out")
     assert done.code == 0, done.err
-    found = json.loads((tmp_path / "out" / "control.json").read_text())["cue_pay"]
+    found = json.loads((tmp_path / "out" / "control.json").read_text())["cue_contrasts"]
     assert [(r["agent"], r["seed"]) for r in found] == [("erm", 0), ("irm", 0)]
     written = artefact(made, "irm.0.cue").directory / "cue.json"
     measured = json.loads(written.read_text())
@@ -85,7 +85,7 @@ def test_the_report_tells_what_each_reward_pays_for_the_cue(made, tables, irl, t
         assert found[1][name] == pytest.approx(sum(s[name] for s in settings) / 2)
     described = json.loads((artefact(made, "irm.0").directory / "reward.json").read_text())
     assert found[1]["scale"] == measured["scale"] == described["scale"] > 0.0
-    assert "## What the reward pays for the cue" in (tmp_path / "out" / "README.md").read_text()
+    assert "## How the reward depends on the cue" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_a_table_may_have_a_lambda_for_a_method(made, tables, irl, tmp_path):

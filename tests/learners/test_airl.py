@@ -10,7 +10,7 @@ import torch
 
 from irlcli.configs import AIRLConfig
 from irlcli.envs.lunar_lander.env import LunarLander
-from irlcli.learners import airl, discriminator, pay
+from irlcli.learners import airl, discriminator, scoring
 from irlcli.learners.actions import clipped_log_prob
 from irlcli.learners.pools import Pool, Stratum, join_pools, make_pool, sample_minibatch
 from irlcli.learners.reward_model import RewardModel
@@ -82,7 +82,7 @@ def test_variable_horizon_reward_forms():
     f = model(*as_tensors(model, data))
     g = model.reward(*as_tensors(model, data)[:2])
     for form, expected in {"f": f, "g": g, "f-log-pi": f - log_probs}.items():
-        reward = pay.policy_reward(model, data, log_probs, form, False, GAMMA)
+        reward = scoring.policy_reward(model, data, log_probs, form, False, GAMMA)
         torch.testing.assert_close(reward, expected)
         assert not reward.requires_grad
 
@@ -112,7 +112,7 @@ def test_absorbing_value_equals_stepping_the_environment(form):
         np.array([horizon - crash - 1]),
     )
     log_probs = torch.tensor([-1.2])
-    closed = pay.policy_reward(model, data, log_probs, form, True, GAMMA).item()
+    closed = scoring.policy_reward(model, data, log_probs, form, True, GAMMA).item()
 
     s = torch.as_tensor(stacked[crash:])
     actions = torch.zeros(len(s) - 1, 4)
@@ -135,7 +135,7 @@ def test_an_episodes_reward_is_the_sum_over_its_horizon(absorbing):
     if absorbing:
         # No action is an action vector of zeros.
         steps += [float(model.reward(s_next[5:], torch.zeros(1, 4)))] * 7
-    assert pay.episode_reward(model, data, absorbing) == pytest.approx(sum(steps), rel=1e-5)
+    assert scoring.episode_reward(model, data, absorbing) == pytest.approx(sum(steps), rel=1e-5)
 
 
 def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():
@@ -300,7 +300,7 @@ def test_reward_scale_is_the_deviation_over_draws():
     with torch.no_grad():
         g = model.reward(pool.observations, pool.actions).numpy().astype(float)
     repeated = np.concatenate([g[:12], np.repeat(g[12:], 7)])
-    assert pay.reward_scale(model, [pool]) == pytest.approx(repeated.std(ddof=1))
+    assert scoring.reward_scale(model, [pool]) == pytest.approx(repeated.std(ddof=1))
 
 
 def test_normaliser_moments_do_not_depend_on_the_batching():

@@ -19,9 +19,9 @@ from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
-from irlcli.learners.pay import bounded_pay, reward_quantiles
 from irlcli.learners.pools import make_pool
 from irlcli.learners.reward_model import RewardModel, build
+from irlcli.learners.scoring import bounded_reward, reward_quantiles
 from irlcli.rl.rollout import roll_out
 from irlcli.trajectories import ActionSpace, Trajectory, Transitions
 
@@ -217,7 +217,7 @@ def test_what_the_reward_cannot_measure_is_refused(tmp_path, smoke_store):
 
 
 def bounded(network, ceiling, absorbing, terminated):
-    """The pay of two steps s = 1, 4 whose successors are s = 2, 8, for a reward g(s, a) = 2 s + 3 a."""
+    """The rewards of two steps s = 1, 4 whose successors are s = 2, 8, for a reward g(s, a) = 2 s + 3 a."""
     model = RewardModel(**network)
     model.load_state_dict(
         {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
@@ -230,7 +230,7 @@ def bounded(network, ceiling, absorbing, terminated):
         terminated=np.array([False, terminated]),
         remaining=np.array([0, 5 * terminated]),
     )
-    return bounded_pay(model, data, ceiling, absorbing, gamma=0.9).tolist()
+    return bounded_reward(model, data, ceiling, absorbing, gamma=0.9).tolist()
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ import torch
 from airl_runs import make, random_episodes
 
 from irlcli.learners.gail import GAIL
-from irlcli.learners.pay import imitation_reward
 from irlcli.learners.reward_model import RewardModel
+from irlcli.learners.scoring import imitation_reward
 from irlcli.trajectories import Transitions
 
 PLAIN = {"kind": GAIL, "logit": "f", "shaping": False, "policy_reward": "f"}

@@ -1,4 +1,4 @@
-"""What makes a reward retrainable: a slope everywhere, challengers, and a ceiling on their pay."""
+"""What makes a reward retrainable: a slope everywhere, challengers, and a ceiling on their reward."""
 
 from copy import deepcopy
 
@@ -413,3 +413,14 @@ def test_a_mean_of_more_rounds_than_there_are_is_refused_before_anything_runs(ir
     done = irl(*line, "--dry-run", "--set", "airl.averaged_rounds=1000")
     assert done.code == 2
     assert "airl.averaged_rounds = 1000, but training has" in done.err
+
+
+def test_a_penalty_that_never_begins_is_refused_and_one_that_stays_small_is_named(irl, smoke_store):
+    line = ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", smoke_store.path]
+    irm = [*line, "--method", "irm", "--penalty-weight", "10"]
+    late = ["--set", "airl.penalty_warmup_rounds=1000"]
+    refused = irl(*irm, *late, "--dry-run")
+    assert refused.code == 2 and "airl.penalty_warmup_rounds = 1000 leaves none of" in refused.err
+    assert irl(*line, "--method", "erm", *late, "--dry-run").code == 0
+    slow = irl(*irm, "--set", "airl.penalty_ramp_rounds=1000")
+    assert slow.code == 0 and "lambda reaches 0.0" in slow.err and "of 10:" in slow.err

@@ -46,7 +46,7 @@ def test_a_saturated_discriminator():
     }
     (caveat,) = build(*example(complete()), {}, learning).caveats
     assert caveat.startswith(f"Saturated: {BOUNCE}, AIRL-IRM: ")
-    assert "96.0% of fresh samples" in caveat
+    assert "96.0% of the round's samples" in caveat
     assert "2.5% of the optimised cross-entropy" in caveat
 
 

@@ -1,4 +1,4 @@
-"""What a reward model pays: step by step to a policy in training, and to a whole episode."""
+"""How a reward model scores the steps of a policy in training, and whole episodes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from torch.nn.functional import softplus
 from irlcli.learners.pools import Pool, make_pool
 from irlcli.learners.reward_model import RewardModel, RewardModule
 from irlcli.trajectories import Transitions
+
+# Of g: a constant reward has no scale.
+SMALLEST_SCALE = 1e-6
 
 
 def policy_reward(
@@ -43,6 +46,7 @@ def policy_reward(
             reward = reward - log_probs
         if absorbing and bool(terminated.any()):
             g, f = model.absorbing_reward(successors)
+            # absorbing_value() rounds otherwise, and would change every key's bytes.
             series = gamma / (1.0 - gamma)
             reward = reward + terminated * series * (g if form == "g" else f)
         return reward
@@ -54,7 +58,7 @@ def imitation_reward(
     """-log(1 - D) = softplus(g) of each transition [B] float32, without gradient.
 
     With ``absorbing``, a terminated transition also earns the discounted sum of its absorbing
-    state's rewards: without it a reward that is never negative pays for staying alive.
+    state's rewards: without it a reward that is never negative favours staying alive.
     """
     with torch.no_grad():
         actions = model.encode(torch.as_tensor(data.actions))
@@ -62,11 +66,11 @@ def imitation_reward(
         terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
         if absorbing and bool(terminated.any()):
             g, _ = model.absorbing_reward(torch.as_tensor(data.next_observations))
-            reward = reward + terminated * gamma / (1.0 - gamma) * softplus(g)
+            reward = reward + absorbing_value(softplus(g), terminated, gamma)
         return reward
 
 
-def bounded_pay(
+def bounded_reward(
     model: RewardModule, data: Transitions, ceiling: float, absorbing: bool, gamma: float
 ) -> torch.Tensor:
     """min(g, ``ceiling``) of each transition [B] float32, without gradient.
@@ -76,24 +80,32 @@ def bounded_pay(
     """
     with torch.no_grad():
         actions = model.encode(torch.as_tensor(data.actions))
-        pay = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
+        reward = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
         terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
         if absorbing and bool(terminated.any()):
             final = torch.as_tensor(data.next_observations)
-            g = model.reward(final, torch.zeros(len(final), model.action_size))
-            pay = pay + terminated * gamma / (1.0 - gamma) * g.clamp(max=ceiling)
-        return pay
+            g = model.reward(final, torch.zeros(len(final), model.action_size)).clamp(max=ceiling)
+            reward = reward + absorbing_value(g, terminated, gamma)
+        return reward
+
+
+def absorbing_value(reward: torch.Tensor, terminated: torch.Tensor, gamma: float) -> torch.Tensor:
+    """Discounted sum [B] of the absorbing state's ``reward`` [B] from the next step on.
+
+    Zero where ``terminated`` [B], float, is zero.
+    """
+    return terminated * gamma / (1.0 - gamma) * reward
 
 
 def reward_scale(model: RewardModule, pools: Sequence[Pool]) -> float:
     """Standard deviation of g over the samples of ``pools``, each row as often as drawn.
 
     Fixed on training data, it makes frozen rewards of different runs comparable. Nothing is
-    centred, which would change what the reward asks for.
+    centred, which would change what the reward asks for. At least :data:`SMALLEST_SCALE`.
     """
     with torch.no_grad():
         g = torch.cat([model.reward(pool.observations, pool.actions)[pool.draw] for pool in pools])
-    return max(float(g.double().std()), 1e-6)
+    return max(float(g.double().std()), SMALLEST_SCALE)
 
 
 def reward_quantiles(model: RewardModule, demonstrations: Sequence[Pool]) -> tuple[float, ...]:

@@ -1,11 +1,11 @@
-"""What a reward pays for a hint: in closed form, with rewards that are known functions."""
+"""How a reward depends on a hint: in closed form, with rewards that are known functions."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from irlcli.report.cue import hint_pay
+from irlcli.report.cue import hint_contrasts
 from irlcli.trajectories import Transitions
 
 TEXTURE, CUE = -2, -1
@@ -21,7 +21,7 @@ def steps(count=200):
 
 
 def pay(score):
-    return hint_pay(lambda s, a, n: score(s), steps())
+    return hint_contrasts(lambda s, a, n: score(s), steps())
 
 
 def test_a_weight_is_paid_twice_between_minus_one_and_one():
