@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from contextlib import closing
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from typing import Any
 
 import gymnasium
@@ -63,12 +64,11 @@ def roll_out(
         rng = np.random.default_rng(
             derive(f"{purpose} actions", seed, first)[0] if own else seeds[0]
         )
-        worlds = [make(env, setting) for _ in batch]
-        if isinstance(policy, Policy):
-            require_observations(policy, worlds[0].observation_space, f"{env} {setting}")
-        trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, noise, rng)
-        for world in worlds:
-            world.close()
+        with ExitStack() as stack:
+            worlds = [stack.enter_context(closing(make(env, setting))) for _ in batch]
+            if isinstance(policy, Policy):
+                require_observations(policy, worlds[0].observation_space, f"{env} {setting}")
+            trajectories += _run_batch(worlds, policy, seeds, limit, deterministic, noise, rng)
     return trajectories
 
 
@@ -78,7 +78,16 @@ def _takes(policy: Policy, env: str, setting: Setting) -> bool:
         return observation_size(world.observation_space) == policy.observation_size
 
 
-def _run_batch(worlds, policy, seeds, limit, deterministic, noise, rng) -> list[Trajectory]:
+def _run_batch(
+    worlds: Sequence[gymnasium.Env],
+    policy: Policy | str,
+    seeds: Sequence[int],
+    limit: int,
+    deterministic: bool,
+    noise: float,
+    rng: np.random.Generator,
+) -> list[Trajectory]:
+    """An episode of at most ``limit`` steps in each of ``worlds``, reset with its seed; see roll_out()."""
     observations = [[w.reset(seed=s)[0]] for w, s in zip(worlds, seeds, strict=True)]
     actions: list[list[Any]] = [[] for _ in worlds]
     rewards: list[list[float]] = [[] for _ in worlds]
