@@ -136,7 +136,7 @@ WRONG = [
     ("train-airl --demos demos --set airl.penalty_weight.x=3", 2, "airl.penalty_weight.x"),
     ("train-airl --demos demos --set airl.penalty_weight=lots", 2, "airl.penalty_weight=lots"),
     ("train-airl --demos demos --set airl.learning_rate=inf", 2, "airl.learning_rate"),
-    ("train-airl --demos demos --set airl.ppo.n_envs=3", 2, "3 worlds"),
+    ("train-airl --demos demos --set airl.ppo.n_envs=3", 2, "airl.ppo.n_envs = 3"),
     ("train-airl --demos demos --set airl.ppo.n_envs=0", 2, "airl.ppo.n_envs"),
     ("train-airl --demos demos --set airl.actions=executed", 2, "needs continuous actions"),
     ("train-airl --demos demos --set airl.actions=clipped", 2, "airl.actions"),

@@ -415,8 +415,8 @@ def test_a_mean_of_more_rounds_than_there_are_is_refused_before_anything_runs(ir
     assert "airl.averaged_rounds = 1000, but training has" in done.err
 
 
-def test_a_penalty_that_never_begins_is_refused_and_one_that_stays_small_is_named(irl, smoke_store):
-    line = ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", smoke_store.path]
+def test_a_penalty_that_never_begins_is_refused_and_one_that_stays_small_is_named(irl, store_copy):
+    line = ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", store_copy.path]
     irm = [*line, "--method", "irm", "--penalty-weight", "10"]
     late = ["--set", "airl.penalty_warmup_rounds=1000"]
     refused = irl(*irm, *late, "--dry-run")
