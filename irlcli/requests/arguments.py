@@ -187,15 +187,15 @@ def row(text: str) -> str:
 
 
 def check_env(ref: str, learned: str, wanted: str | None) -> None:
-    """Refuse ``--env`` if it is not the environment in which the file ``ref`` was learned.
+    """Refuse ``--env`` if it is not the environment that ``ref`` belongs to.
 
     Raises:
         UsageError: another environment.
     """
     if wanted is not None and wanted != learned:
         raise UsageError(
-            f"{ref!r} was learned in {learned}, not in {wanted}",
-            "rewards and policies do not fit another environment's observations",
+            f"{ref!r} belongs to {learned}, not to {wanted}",
+            "a copy of an environment's file is another environment unless it sets the same name",
         )
 
 

@@ -135,9 +135,9 @@ def _check_rounds(airl: AIRLConfig) -> None:
     rounds, averaged = airl.ppo.rounds(airl.total_steps), airl.averaged_rounds or 1
     if airl.penalty != "none" and airl.penalty_warmup_rounds >= rounds:
         raise UsageError(
-            f"airl.penalty_warmup_rounds = {airl.penalty_warmup_rounds} leaves none of {rounds} "
-            "rounds with a penalty",
-            f"--set airl.penalty_warmup_rounds={rounds - 1} or less, or --set airl.total_steps="
+            f"airl.penalty_warmup_rounds = {airl.penalty_warmup_rounds} leaves no round with a "
+            f"penalty: training has {rounds}",
+            f"--set airl.penalty_warmup_rounds={rounds - 1}, or --set airl.total_steps="
             f"{(airl.penalty_warmup_rounds + 1) * airl.ppo.steps_per_round} or more",
         )
     if averaged > rounds:

@@ -53,7 +53,10 @@ def open_sources(places: Iterable[Path | str], warn: Callable[[str], None]) -> l
     for place in places:
         store = open_place(place, warn, read_only=True)
         if not store.exists():
-            raise NotFound(f"{place} is not a store", "name a store with --from or IRL_FROM")
+            raise NotFound(
+                f"{place} is not a store",
+                "--from and IRL_FROM take the directory or URL of a store, such as zoo",
+            )
         stores.append(store)
     return stores
 

@@ -87,7 +87,7 @@ WRONG = [
     ("evaluate --policy airl --ood slow", 2, "'slow'"),
     ("evaluate --policy airl --env moon", 2, "'moon'"),
     ("evaluate --policy airl --env test-world", 2, "test-world"),
-    ("transfer --reward airl --ood 1.5x --env test-world", 2, "learned in lunar-lander"),
+    ("transfer --reward airl --ood 1.5x --env test-world", 2, "belongs to lunar-lander"),
     # Numbers
     (f"collect-experts {LANDER} --episodes 0", 2, "0 episodes"),
     (f"collect-experts {LANDER} --episodes -3", 2, "-3 episodes"),
