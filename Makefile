@@ -57,6 +57,7 @@ help:
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	@echo 'installing into $(VENV): some minutes, without further output'
 	$(VENV)/bin/pip install --quiet --constraint constraints.txt --editable '.[test,dev]'
 	touch $@
 

@@ -245,7 +245,7 @@ def _comparison(name: str, filled: Mapping[str, Any], directory: Path) -> dict[s
 def _variants(name: str, filled: Mapping[str, Any]) -> tuple[Variant, ...]:
     if "variants" not in filled:
         if "base" in filled:
-            raise UsageError(f"{name}.base: {name} has no variants", "omit base")
+            raise UsageError(f"{name}.base: {name} has no variants", f"add [{name}.variants], or omit base")
         return ()
     variants = read_variants(f"{name}.variants", filled["variants"], filled.get("base"))
     _check_single(f"{name}.methods", filled["methods"])
