@@ -16,7 +16,7 @@
 #   SET="--set FIELD=VALUE"          other hyperparameters; needs a TAG
 #   CHOOSE="--choose-penalty 1,10"   lambda by leaving a setting out; needs a TAG
 #   TAG=NAME                         what the artefacts' names begin with; by default the profile
-#   JOBS=2                           processes at a time
+#   JOBS=2                           processes at a time; Slurm's jobs are not limited by it
 #   CLUSTER=slurm PARTITION=P TIME=4:00:00 CPUS=1   jobs of a cluster instead (docs/cluster.md)
 #   STORE=DIR                        artefact store; by default IRL_STORE or runs
 #   FROM=DIR                         store to copy from what it holds, or a URL; FROM= trains everything
@@ -44,7 +44,7 @@ IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
 CHOSEN   = --store $(STORE) --profile $(PROFILE) $(addprefix --from ,$(FROM)) $(SET) $(CHOOSE) \
     $(if $(SEEDS),--seeds "$(SEEDS)") $(if $(METHODS),--methods "$(METHODS)") $(addprefix --rows ,$(LISTED))
-OPTIONS  = $(CHOSEN) --jobs $(JOBS) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
+OPTIONS  = $(CHOSEN) $(if $(filter slurm,$(CLUSTER)),,--jobs $(JOBS)) $(addprefix --tag ,$(TAG)) $(addprefix --cluster ,$(CLUSTER)) \
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
 
 .PHONY: help demo test test-cluster lint bench bench-peers torture all-results experts table1 table2 figure2 figure3 figure4

@@ -83,7 +83,7 @@ def show(session: Session, ref: Ref) -> None:
         "other_versions": provenance.other_versions(origin),
     }
     if session.as_json:
-        out.print_json("artefact", value)
+        out.print_json("shown", value)
     else:
         out.print_data(json.dumps(value, indent=2))
 

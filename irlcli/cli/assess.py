@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from irlcli.cli import console as out
-from irlcli.cli.options import Env, Name, Seed, stage_command
+from irlcli.cli.options import Env, Name, OneSetting, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured
 from irlcli.experiments import references
@@ -25,6 +25,7 @@ def assess(
         str | None,
         typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (ID values). Default: trained in."),
     ] = None,
+    setting: OneSetting = [],  # noqa: B006
     demos: Annotated[
         str | None,
         typer.Option(help="Demonstrations for the ladder of noise. Default: the reward's own."),
@@ -40,6 +41,7 @@ def assess(
         reward=reward,
         ood=ood,
         intervention=intervention,
+        setting=setting,
         demos=demos,
         episodes=episodes,
         env=env,

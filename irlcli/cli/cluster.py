@@ -41,7 +41,7 @@ class ClusterOptions(NamedTuple):
 
     Attributes:
         cluster: ``slurm`` or ``local``.
-        local_jobs: processes at a time of ``local``, which has no partition.
+        jobs: processes at a time, here or of ``local``.
     """
 
     cluster: str | None
@@ -51,7 +51,7 @@ class ClusterOptions(NamedTuple):
     parallelism: int | None
     sbatch: Sequence[str]
     requeues: int | None
-    local_jobs: int
+    jobs: int | None
 
     def check_used(self, detach: bool) -> None:
         """Refuse options that a run with this ``--cluster`` would ignore.
@@ -76,6 +76,10 @@ class ClusterOptions(NamedTuple):
                 f"{of_jobs[0]} needs --cluster", f"add --cluster slurm, or omit {of_jobs[0]}"
             )
         of_slurm = [name for name, given in slurm.items() if given]
+        if self.cluster == "slurm" and self.jobs is not None:
+            raise UsageError(
+                "--jobs does not limit the jobs of Slurm", "use --array-parallelism instead"
+            )
         if self.cluster == "local" and of_slurm:
             raise UsageError(
                 f"{of_slurm[0]} needs --cluster slurm",
@@ -179,16 +183,16 @@ def run_jobs(
         command,
         Path.cwd(),
         DEFAULT_REQUEUES if options.requeues is None else options.requeues,
-        options.local_jobs,
+        options.jobs or 1,
     )
     submission = Submission(found, runner, queue, job, display)
     try:
         count = submission.submit(
-            lambda: session.console.say("a probe job looks at the store from a node"),
+            lambda: session.console.say("a probe job checks the store from a node"),
             session.console.warn,
         )
         if count:
-            session.console.say(f"{count} jobs submitted")
+            session.console.say(f"{out.counted(count, 'job')} submitted")
         if detach:
             if session.as_json:
                 out.print_json("submission", {"table": found.table.name, "submitted": count})
@@ -264,4 +268,4 @@ def cancel(session: StageSession, found: "Plan", options: ClusterOptions) -> Non
         out.print_json("cancel", {"table": found.table.name, "jobs": len(there)})
         return
     after = "; those that ran leave a checkpoint" if there else ""
-    out.print_note(f"{len(there)} jobs cancelled{after}")
+    out.print_note(f"{out.counted(len(there), 'job')} cancelled{after}")

@@ -202,6 +202,11 @@ def _write(text: str, stream: TextIO) -> None:
         hang_up()
 
 
+def counted(number: int, noun: str) -> str:
+    """``1 job`` or ``2 jobs``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def print_note(text: str) -> None:
     """Lines for the reader on stderr, beside the data."""
     _write(text.translate(_CONTROLS_BUT_NEWLINE), sys.stderr)

@@ -119,7 +119,9 @@ def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
 def run(
     session: StageSession,
     table: _TableName,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes at a time.")] = 1,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes at a time. Default: 1.")
+    ] = None,
     seeds: Seeds = None,
     methods: Methods = None,
     rows: Rows = None,
@@ -197,10 +199,10 @@ def run(
     options = ClusterOptions(
         cluster, partition, time, cpus, array_parallelism, sbatch, requeues, jobs
     )
-    _check_options(session, choice, directory, options)
-    options.check_used(detach)
     if status + cancel + detach > 1:
         raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
+    _check_options(session, choice, directory, options, "status" * status + "cancel" * cancel)
+    options.check_used(detach)
     if session.dry_run and (status or cancel):
         raise UsageError(
             "--dry-run shows the plan, not the jobs", "omit --dry-run, or --status and --cancel"
@@ -219,7 +221,7 @@ def run(
             _make_one(session, runner, found, only)
             return
         if cluster is None:
-            outcome = _make_all(session, runner, found, choice, jobs)
+            outcome = _make_all(session, runner, found, choice, jobs or 1)
         else:
             words = _child_words(session, choice, found)
             ended = cluster_jobs.run_jobs(session, runner, found, words, options, detach)
@@ -235,9 +237,15 @@ def run(
 
 
 def _check_options(
-    session: StageSession, choice: Choice, directory: Path | None, options: ClusterOptions
+    session: StageSession,
+    choice: Choice,
+    directory: Path | None,
+    options: ClusterOptions,
+    about_jobs: str,
 ) -> None:
     """Refuse options that contradict each other, or would be ignored, before any work.
+
+    ``about_jobs`` is ``status``, ``cancel`` or empty.
 
     Raises:
         UsageError: names them.
@@ -248,8 +256,10 @@ def _check_options(
             "--settings, --set and --choose-penalty make other artefacts than the profile alone",
             "name them: --tag NAME",
         )
-    if choice.only is not None and (choice.until is not None or directory is not None):
-        raise UsageError("--only takes no --until and no --out", "it makes one step")
+    if choice.only is not None and (choice.until or directory or options.jobs):
+        raise UsageError("--only takes no --until, --out or --jobs", "it makes one step")
+    if about_jobs and (directory or options.jobs):
+        raise UsageError(f"--{about_jobs} takes no --out and no --jobs", "it makes no step")
     if choice.until is not None and directory is not None:
         raise UsageError("--until makes no report, so --out has no files", "omit one of them")
     if choice.only is not None and options.cluster is not None:
@@ -351,9 +361,10 @@ def _raise_for(outcome: "Outcome", found: "Plan", continue_hint: str) -> None:
         names = ", ".join(list(outcome.failed)[:3])
         names += f" and {len(outcome.failed) - 3} more" if len(outcome.failed) > 3 else ""
         waiting = f"; {len(outcome.blocked)} wait for them" if outcome.blocked else ""
+        again = "run the same command again: finished steps are kept"
         error = StageFailed(
             f"{len(outcome.failed)} of {total} steps failed: {names}{waiting}",
-            "fix the problem and run the same command again: finished steps are kept",
+            again if outcome.exit_code in (75, 130) else f"fix the problem and {again}",
         )
         error.details = {
             "failed": {name: failure._asdict() for name, failure in outcome.failed.items()},

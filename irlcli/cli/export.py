@@ -1,9 +1,7 @@
 """``irl export``."""
 
-import os
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -105,25 +103,10 @@ def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
     return Path(name)
 
 
-@contextmanager
-def _new_file(session: Session, path: Path) -> Iterator[Path]:
-    """A file or directory beside ``path`` that takes its name once it is whole.
-
-    Raises:
-        UsageError: ``path`` exists, lies in the store, or cannot be written.
-    """
+def _new_file(session: Session, path: Path) -> AbstractContextManager[Path]:
     if path.exists():
         raise UsageError(f"{path} exists", "name another file, or remove it first")
-    session.check_file(path, "--to")
-    try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".irl-export-") as scratch:
-            part = Path(scratch) / path.name
-            yield part
-            os.rename(part, path)
-    except OSError as error:
-        raise UsageError(
-            f"{path} cannot be written: {error.strerror or error}", "name another file with --to"
-        ) from None
+    return session.whole_file(path, "--to")
 
 
 _TARGETS: dict[str, dict[str, Callable[[Session, str, str], Path]]] = {

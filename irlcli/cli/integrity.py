@@ -70,7 +70,7 @@ def verify(
     if session.as_json:
         out.print_json("verify", result)
     else:
-        out.print_data(f"{_count(checked, 'artefact')} verified")
+        out.print_data(f"{out.counted(checked, 'artefact')} verified")
 
 
 def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> None:
@@ -151,10 +151,8 @@ def gc(
     for path in submissions:
         out.print_data(f"{path.name}  logs of jobs that have ended")
     verb = "removed" if delete else "would be removed (add --delete)"
-    logs = f", {_count(len(submissions), 'submission')}" if submissions else ""
-    scratch = f" and scratch of {_count(len(work), 'run')}" if work else ""
-    out.print_note(f"{_count(len(artefacts), 'artefact')}, {size:,} bytes{logs}{scratch} {verb}")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    logs = f", {out.counted(len(submissions), 'submission')}" if submissions else ""
+    scratch = f" and scratch of {out.counted(len(work), 'run')}" if work else ""
+    out.print_note(
+        f"{out.counted(len(artefacts), 'artefact')}, {size:,} bytes{logs}{scratch} {verb}"
+    )

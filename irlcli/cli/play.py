@@ -1,7 +1,5 @@
 """``irl play``."""
 
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -56,10 +54,7 @@ def play(
     arguments.check_env(policy, origin.env, known)
     env = origin.env
     settings = [parse_setting(env, text) for text in origin.settings]
-    named = (
-        [] if ood is None else arguments.named_settings(env, load_config(env), ood, "ood", origin)
-    )
-    added = arguments.with_several(env, named, setting, origin)
+    added = arguments.where(ood, None, setting).settings(env, load_config(env), origin)
     settings += [one for one in added if one not in settings]
     if file.suffix.lower() not in (".gif", ".mp4"):
         raise UsageError(f"{str(file)!r} ends in neither .gif nor .mp4", "name such a file")
@@ -74,16 +69,9 @@ def play(
 
     player, _ = load_policy_file(checked(session.store, source))
     rewards = None if scored_by is None else _rewards(session, scored_by[0], env, settings)
-    try:
-        played = film(player, env, settings, steps, seed, rewards)
-        with tempfile.TemporaryDirectory(dir=file.parent, prefix=".irl-play-") as scratch:
-            part = Path(scratch) / f"film{file.suffix.lower()}"
-            (write_mp4 if part.suffix == ".mp4" else write_gif)(part, played)
-            os.replace(part, file)
-    except OSError as error:
-        raise UsageError(
-            f"{file} cannot be written: {error.strerror or error}", "name another file with --out"
-        ) from None
+    with session.whole_file(file, "--out") as part:
+        write = write_mp4 if file.suffix.lower() == ".mp4" else write_gif
+        write(part, film(player, env, settings, steps, seed, rewards))
     if session.as_json:
         document = {
             "path": str(file),

@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,6 +67,28 @@ class Session(base.Session):
             )
         if path.resolve().is_relative_to(self.store.root.resolve()):
             raise UsageError(f"{path} lies in the store", f"name another file with {option}")
+
+    @contextmanager
+    def whole_file(self, path: Path, option: str) -> Iterator[Path]:
+        """A file or directory to write, which takes the place of ``path`` once it is whole.
+
+        Raises:
+            UsageError: as :meth:`check_file`, or its directory is not writable.
+        """
+        import tempfile
+
+        self.check_file(path, option)
+        try:
+            scratch = tempfile.TemporaryDirectory(dir=path.parent, prefix=".irl-")
+        except OSError as error:
+            raise UsageError(
+                f"{path} cannot be written: {error.strerror or error}",
+                f"name another file with {option}",
+            ) from None
+        with scratch as directory:
+            part = Path(directory) / path.name
+            yield part
+            os.replace(part, path)
 
 
 class StageSession(base.StageSession):

@@ -139,7 +139,7 @@ def _share(
         )
     where = f"{target.root}/"
     console.say(
-        f"{_artefacts(len(shared.copied))}, {shared.bytes:,} bytes copied to {target.root}; "
+        f"{out.counted(len(shared.copied), 'artefact')}, {shared.bytes:,} bytes copied to {target.root}; "
         f"{len(shared.present)} there already"
     )
     if session.as_json:
@@ -160,7 +160,3 @@ def _share(
 
 def _damaged_there(place: "Place") -> str:
     return f"remove the artefact in {place.root}, then compute or push it again"
-
-
-def _artefacts(count: int) -> str:
-    return f"{count} artefact" if count == 1 else f"{count} artefacts"

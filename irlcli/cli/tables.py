@@ -105,7 +105,7 @@ def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:
         others = other_versions({"libraries": versions})
         if others:
             session.console.warn(
-                f"{names.count(name)} artefacts of this report were made with other library "
+                f"{out.counted(names.count(name), 'artefact')} of this report made with other library "
                 f"versions: {', '.join(others)}"
             )
 

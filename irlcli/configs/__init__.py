@@ -1,20 +1,16 @@
 """Hyperparameters: their schema, which of them matter, and how they are loaded."""
 
-from irlcli.configs.load import PROFILES, check_profile, lacks_profile, load_config
+from irlcli.configs.load import PROFILES, check_profile, file_without_profile, load_config
 from irlcli.configs.schema import (
     AIRLConfig,
-    AssessmentConfig,
     ChallengerConfig,
-    CloneConfig,
     Config,
     ControlConfig,
     CuedLabelsConfig,
     CuedMapsConfig,
-    DemonstrationConfig,
     EvaluationConfig,
     ExpertConfig,
     Figure2Config,
-    FromStudentConfig,
     GridworldConfig,
     InterventionConfig,
     MaxEntConfig,
@@ -26,18 +22,14 @@ from irlcli.configs.schema import (
 __all__ = [
     "PROFILES",
     "AIRLConfig",
-    "AssessmentConfig",
-    "CloneConfig",
     "ChallengerConfig",
     "Config",
     "ControlConfig",
     "CuedLabelsConfig",
     "CuedMapsConfig",
-    "DemonstrationConfig",
     "EvaluationConfig",
     "ExpertConfig",
     "Figure2Config",
-    "FromStudentConfig",
     "GridworldConfig",
     "InterventionConfig",
     "MaxEntConfig",
@@ -45,6 +37,6 @@ __all__ = [
     "SACConfig",
     "TransferConfig",
     "check_profile",
-    "lacks_profile",
+    "file_without_profile",
     "load_config",
 ]

@@ -68,8 +68,8 @@ def load_config(
         flags: dotted field to value; None is left out.
 
     Raises:
-        UsageError: unknown environment, profile, field or value; malformed TOML.
-        OSError: ``file`` cannot be read.
+        UsageError: unknown environment, profile, field or value; malformed or unreadable TOML; a
+            field that ``overrides`` and ``flags`` set to different values.
     """
     known = None if env == CONTROL else environment(env).own
     check_profile(profile)
@@ -81,7 +81,9 @@ def load_config(
     layers = in_profile(own, tree, profile)
     if file is not None:
         layers += in_profile(str(file), read_toml(file), profile)
-    layers += [(f"--set {item!r}", _override(item)) for item in overrides]
+    nested = [(item, _override(item)) for item in overrides]
+    _check_set_once(nested, flags or {})
+    layers += [(f"--set {item!r}", values) for item, values in nested]
     layers += [
         (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted.split("."), value))
         for dotted, value in (flags or {}).items()
@@ -90,7 +92,19 @@ def load_config(
     return _stack(env, layers)
 
 
-def lacks_profile(env: str, profile: str) -> str:
+def _check_set_once(overrides: Sequence[Layer], flags: Mapping[str, Any]) -> None:
+    """Refuse an override whose field a flag sets to another value: it would be ignored."""
+    for item, values in overrides:
+        dotted, value = _field_of(item, values)
+        if flags.get(dotted) not in (None, value):
+            raise UsageError(
+                f"--set {item!r}: another option sets {dotted} to {flags[dotted]!r}",
+                f"omit --set {dotted}, or --{dotted.rpartition('.')[2].replace('_', '-')} "
+                "or --method, whichever sets it",
+            )
+
+
+def file_without_profile(env: str, profile: str) -> str:
     """The TOML file of an environment of one's own that has no section for ``profile``; else empty.
 
     ``standard``, the default, needs none.
@@ -198,14 +212,12 @@ def overridden(items: Sequence[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     values: dict[str, Any] = {}
     for item in items:
-        dotted = item.partition("=")[0].strip()
         nested = _override(item)
+        dotted, value = _field_of(item, nested)
         if dotted in values:
             raise UsageError(f"{dotted} appears twice", "name each field once")
         tree = _merge(tree, nested)
-        for name in dotted.split("."):
-            nested = nested[name]
-        values[dotted] = nested
+        values[dotted] = value
     check_registered(msgspec.convert(tree, Config))
     return values
 
@@ -357,12 +369,22 @@ def _override(item: str) -> dict[str, Any]:
         if kind == _INTERVENTIONS:
             raise UsageError(
                 f"--set {item!r}: --set does not change interventions",
-                "use --intervention or --ood",
+                "use --intervention or --ood; for a table write [interventions.KNOB] in a file for "
+                "--settings",
             )
     if isinstance(kind, type) and issubclass(kind, Struct):
         names = ", ".join(f"{dotted.strip()}.{f.name}" for f in msgspec.structs.fields(kind))
         raise UsageError(f"--set {item!r} names a group of fields", f"one of: {names}")
     return _nest(path, _typed(text.strip(), kind, dotted.strip()))
+
+
+def _field_of(item: str, nested: Mapping[str, Any]) -> tuple[str, Any]:
+    """The field that ``item`` of ``--set`` names, and its value in ``nested``."""
+    dotted = item.partition("=")[0].strip()
+    value: Any = nested
+    for name in dotted.split("."):
+        value = value[name]
+    return dotted, value
 
 
 def _homes(name: str) -> list[str]:

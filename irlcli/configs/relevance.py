@@ -9,7 +9,14 @@ from collections.abc import Iterable
 from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
-from irlcli.configs.schema import AIRLConfig, Config, MaxEntConfig, PPOConfig, TransferConfig
+from irlcli.configs.schema import (
+    ADAM_EPS,
+    AIRLConfig,
+    Config,
+    MaxEntConfig,
+    PPOConfig,
+    TransferConfig,
+)
 from irlcli.errors import UsageError, suggest
 from irlcli.learners import LEARNERS
 from irlcli.penalties import PENALTIES, check_penalty
@@ -34,21 +41,33 @@ def check_registered(config: Config) -> None:
     Raises:
         UsageError: an unknown learner, algorithm or penalty; the message names the field.
     """
-    _check_known("airl.learner", config.airl.learner, LEARNERS)
-    _check_known("transfer.algorithm", config.transfer.algorithm, ALGORITHMS)
-    for section, penalty in (("airl", config.airl.penalty), ("maxent", config.maxent.penalty)):
-        try:
-            check_penalty(penalty, section)
-        except UsageError as error:
-            raise UsageError(f"{section}.penalty: {error.message}", error.hint) from None
+    _check_sections("", config.airl, config.transfer)
+    _check_penalty("maxent", config.maxent.penalty, "maxent")
+    for knob, listed in config.interventions.items():
+        _check_sections(f"interventions.{knob}.", listed.airl, listed.transfer)
+
+
+def _check_sections(prefix: str, airl: AIRLConfig | None, transfer: TransferConfig | None) -> None:
+    if airl is not None:
+        _check_known(f"{prefix}airl.learner", airl.learner, LEARNERS)
+        _check_penalty(f"{prefix}airl", airl.penalty, "airl")
+    if transfer is not None:
+        _check_known(f"{prefix}transfer.algorithm", transfer.algorithm, ALGORITHMS)
+
+
+def _check_penalty(section: str, penalty: str, learner: str) -> None:
+    try:
+        check_penalty(penalty, learner)
+    except UsageError as error:
+        raise UsageError(f"{section}.penalty: {error.message}", error.hint) from None
 
 
 def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOConfig:
     """``ppo`` for an environment with discrete actions, or with continuous ones.
 
     Raises:
-        UsageError: an option for continuous actions where they are discrete; the message names
-            ``section``, for example ``expert.ppo``.
+        UsageError: an option for continuous actions where they are discrete, or a cap that gSDE does
+            not heed; the message names ``section``, for example ``expert.ppo``.
     """
     if discrete_actions:
         for name in ("use_sde", "log_std_init", "log_std_max"):
@@ -58,6 +77,13 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
                 )
     if not ppo.use_sde:
         ppo = replace(ppo, sde_sample_freq=None)
+    elif ppo.log_std_max is not None:
+        raise UsageError(
+            f"{section}.log_std_max does not bound the noise of gSDE",
+            f"set {section}.log_std_max to none, or {section}.use_sde to false",
+        )
+    if ppo.adam_eps == ADAM_EPS:
+        ppo = replace(ppo, adam_eps=UNSET)
     if ppo.ent_coef == 0.0:
         ppo = replace(ppo, ent_coef_schedule=_PPO.ent_coef_schedule)
     if not ppo.net_arch:

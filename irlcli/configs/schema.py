@@ -34,6 +34,10 @@ Averaged = Literal["rounds", "learning-rate"]
 Grouping = Literal["pooled", "balanced", "per-setting", "shuffled"]
 
 
+# Torch's. See PPOConfig.adam_eps.
+ADAM_EPS = 1e-8
+
+
 class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """PPO (paper App. C names the values of rl-baselines3-zoo). ``linear`` falls to zero.
 
@@ -46,6 +50,8 @@ class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         log_std_max: cap on the policy's log standard deviation. The environment clips actions,
             so noise beyond the bounds costs the policy nothing.
         use_sde: gSDE: noise is held for ``sde_sample_freq`` steps (None: for a rollout).
+        adam_eps: what Adam adds to the root of a gradient's second moment. Unset: 1e-8, torch's;
+            stable-baselines3 has 1e-5, which slows down weights with smaller gradients.
     """
 
     # Bounded, so that no file can ask for more worlds or steps than memory holds.
@@ -73,6 +79,7 @@ class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     log_std_max: Finite | None = None
     use_sde: bool = False
     sde_sample_freq: Count | None = None
+    adam_eps: Positive | UnsetType = UNSET
 
     @property
     def steps_per_round(self) -> int:

@@ -21,8 +21,8 @@ from irlcli.stages import choose_penalty
 from irlcli.store import Artefact
 
 _POLL_SECONDS = 0.05
-# From the mildest to the worst: busy, killed, missing reference, usage, failed, integrity.
-_SEVERITY = (75, 141, 130, 3, 2, 1, 4)
+# From the mildest to the worst: busy, interrupted, missing reference, usage, failed, integrity.
+_SEVERITY = (75, 130, 3, 2, 1, 4)
 
 
 class Outcome(NamedTuple):
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
         if self.interrupted:
             return 130
         codes = {failure.code for failure in self.failed.values()}
-        return max(codes, key=lambda c: _SEVERITY.index(c) if c in _SEVERITY else 5, default=0)
+        return max(codes, key=lambda c: _SEVERITY.index(c) if c in _SEVERITY else 4, default=0)
 
 
 class Display(Protocol):

@@ -52,7 +52,7 @@ def tensor_file(
         if not path.exists():
             raise NotFound(
                 f"{ref!r} is neither an artefact nor a directory with {kind}.pt",
-                f"name an artefact or a {kind} file; `irl ls` lists the artefacts",
+                f"name an artefact or a {kind} file; {store.listing}",
             )
         description, _ = load(path, kind)
         return source_of(Resolved(None, path)), description
@@ -170,9 +170,7 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
         from irlcli.data.demonstrations import EPISODES, STEPS, read_demonstrations
 
         if not any((Path(ref) / name).exists() for name in (EPISODES, STEPS)):
-            hint = (
-                "name an artefact, or a directory of demonstrations; `irl ls` lists the artefacts"
-            )
+            hint = f"name an artefact, or a directory of demonstrations; {store.listing}"
             if Path(ref).is_file():
                 hint = f"`irl import {ref}` makes demonstrations of a recording"
             raise NotFound(f"{ref!r} is neither an artefact nor a directory with {EPISODES}", hint)

@@ -136,6 +136,8 @@ def _reason(plan: Plan, request: Request) -> str:
     stage = first.label.split()[0]
     if first.status == "RESUME":
         return f"{stage} was interrupted or is running"
+    if first.status == "FOUND":
+        return f"{stage} is {first.why}, and `irl run` copies it"
     return f"{stage} has not run"
 
 

@@ -215,7 +215,7 @@ def comparison(
     trained, unseen = requests.trained, requests.unseen
     if not trained or len(unseen) != 1:
         raise UsageError(
-            f"{row} has {len(trained)} settings to train in and {len(unseen)} held out",
+            f"{row}: settings to train in: {len(trained)}, held out: {len(unseen)}",
             "a row needs at least one to train in and exactly one held out",
         )
     yield from requests.expert_tasks([*trained, *unseen])

@@ -1,6 +1,6 @@
 """From a request to an artefact: plan, look up, compute, resume, publish.
 
-``Runner(store).run(request)`` is the whole Python API; the command line uses the same.
+The command line and :class:`irlcli.Lab` make every artefact by ``Runner(store).run(request)``.
 """
 
 import gc

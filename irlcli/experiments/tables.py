@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import msgspec
 
 from irlcli.configs.load import load_config, read_toml, settings_directory
+from irlcli.envs.announced import announced
 from irlcli.envs.registry import ENVIRONMENTS, environment, is_known, resolve
 from irlcli.envs.spec import EnvironmentSpec
 from irlcli.errors import NotFound, UsageError, closest, suggest
@@ -157,7 +158,9 @@ def narrowed(
         offered = table.rows
         if table.kind == "experts":
             own = {name.partition(".")[0] for name in rows} - {*ENVIRONMENTS}
-            offered += _rows_of(*(environment(env) for env in sorted(own) if is_known(env)))
+            offered += _rows_of(
+                *(environment(env) for env in sorted(own) if is_known(env) or env in announced())
+            )
         names = {name: None for row in offered for name in (row.env, str(row))}
         if not rows:
             raise UsageError("--rows: the list is empty", f"name some of: {', '.join(names)}")
@@ -245,7 +248,9 @@ def _comparison(name: str, filled: Mapping[str, Any], directory: Path) -> dict[s
 def _variants(name: str, filled: Mapping[str, Any]) -> tuple[Variant, ...]:
     if "variants" not in filled:
         if "base" in filled:
-            raise UsageError(f"{name}.base: {name} has no variants", f"add [{name}.variants], or omit base")
+            raise UsageError(
+                f"{name}.base: {name} has no variants", f"add [{name}.variants], or omit base"
+            )
         return ()
     variants = read_variants(f"{name}.variants", filled["variants"], filled.get("base"))
     _check_single(f"{name}.methods", filled["methods"])

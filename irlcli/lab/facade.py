@@ -351,6 +351,7 @@ class Lab:
         ood: str | Sequence[str] | None = None,
         *,
         intervention: str | Sequence[str] | None = None,
+        setting: str | Sequence[str] = (),
         demos: Ref | None = None,
         env: str | Path | None = None,
         episodes: int | None = None,
@@ -362,7 +363,7 @@ class Lab:
 
         Args:
             reward: a learned reward.
-            ood, intervention: settings; by default those the reward was learned in.
+            ood, intervention, setting: settings; by default those the reward was learned in.
             demos: demonstrations for the ladder of noise; by default the reward's own.
             env: TOML file of the environment, for a reward outside the store.
             episodes: of each policy.
@@ -373,6 +374,7 @@ class Lab:
         options: dict[str, Any] = {
             "ood": joined(ood),
             "intervention": joined(intervention),
+            "setting": listed(setting),
             "demos": None if demos is None else self._ref(demos),
             "env": None if env is None else str(env),
             "episodes": None if episodes is None else whole("episodes", episodes, 1),

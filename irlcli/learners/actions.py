@@ -46,7 +46,7 @@ class ActionView:
         return replace(data, actions=self.seen(data.actions)) if self.clipped else data
 
     def seen(self, actions: np.ndarray) -> np.ndarray:
-        """What the learner sees of ``actions`` [B] or [B, A]."""
+        """What the learner sees of ``actions`` [B], [B, K] or [B, A]."""
         return np.clip(actions, self._space.low, self._space.high) if self.clipped else actions
 
     def bounds(self) -> tuple[torch.Tensor | None, torch.Tensor | None]:
@@ -64,6 +64,27 @@ class ActionView:
         mean, std = policy.gaussian(observations, gradient)
         low, high = torch.as_tensor(self._space.low), torch.as_tensor(self._space.high)
         return clipped_log_prob(mean, std, actions, low, high)
+
+
+def check_fit(data: Transitions, observation_size: int, space: ActionSpace) -> None:
+    """Check that demonstrations ``data`` are of an environment with these observations and actions.
+
+    Raises:
+        ValueError: they are not.
+    """
+    size = data.observations.shape[1]
+    if size != observation_size:
+        raise ValueError(
+            f"the demonstrations have observations of size {size}, the environment "
+            f"{observation_size}"
+        )
+    shape = data.actions.shape[1:]
+    if shape != space.shape or (data.actions.dtype == np.int64) != space.discrete:
+        raise ValueError(
+            f"the demonstrations have actions of shape {list(shape)} and type "
+            f"{data.actions.dtype}, the environment has {'int64' if space.discrete else 'float32'} "
+            f"of shape {list(space.shape)}"
+        )
 
 
 def clipped_log_prob(

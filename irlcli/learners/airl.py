@@ -34,7 +34,7 @@ import torch
 from irlcli.configs.schema import AIRLConfig
 from irlcli.data.descriptions import RewardNetwork
 from irlcli.errors import StageFailed
-from irlcli.learners.actions import ActionView, Policy
+from irlcli.learners.actions import ActionView, Policy, check_fit
 from irlcli.learners.averaging import averaged_after
 from irlcli.learners.cloning import clone
 from irlcli.learners.discriminator import (
@@ -95,7 +95,7 @@ class AIRL:
         seed: initialisation and every minibatch derive from it.
 
     Raises:
-        ValueError: the demonstrations' observations are not of size D.
+        ValueError: the demonstrations have other observations or actions than the environment.
     """
 
     def __init__(
@@ -120,12 +120,7 @@ class AIRL:
             [self.view.of(transitions([episode], horizon)) for episode in episodes]
             for episodes in demonstrations
         ]
-        size = self._demonstrations[0][0].observations.shape[1]
-        if size != observation_size:
-            raise ValueError(
-                f"the demonstrations have observations of size {size}, the environment "
-                f"{observation_size}"
-            )
+        check_fit(self._demonstrations[0][0], observation_size, actions)
         rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
         counts = [len(episodes) for episodes in demonstrations]
         self._groups = group(config.grouping, counts, rng)
@@ -167,7 +162,8 @@ class AIRL:
             config.challenger.replay_episodes_per_round,
             config.challenger.replay_capacity,
         )
-        # Standard deviation of the deployed g on the last round's samples.
+        # Standard deviation of the deployed g on the last round's samples of the student and on the
+        # demonstrations.
         self.scale = 1.0
         for episodes in self._demonstrations:
             self.model.normaliser.update(torch.as_tensor(join(episodes).observations))
@@ -257,7 +253,9 @@ class AIRL:
         if self.network.members > 1:
             for _ in range(self._joins[index]):
                 self._members.append(deepcopy(self.model).requires_grad_(False))
-        self.scale = reward_scale(self.deployed, [*current, *expert])
+        # No round's mean but the last one's is deployed, and a mean of 30 takes a tenth of a round.
+        if self.network.members == 1 or index + 1 == self._rounds:
+            self.scale = reward_scale(self.deployed, [*current, *expert])
         optimised_cross_entropy, optimised_penalty = np.mean(losses, 0)
         return [
             diagnostics
@@ -411,7 +409,7 @@ class AIRL:
     ) -> list[dict[str, float]]:
         """Per setting, whatever the grouping, so that methods can be compared.
 
-        The penalty has the form (scaling, estimate) of this config.
+        The penalty is the unbiased IRMv1 of the logits, whatever this config's is.
         """
         found = []
         risks = [
@@ -422,7 +420,7 @@ class AIRL:
             batch = sample_minibatch(risks, generator)
             logits, f = discriminator_logits(self.model, batch, self.config.logit)
             entropies = cross_entropy(logits)
-            measure, options = discriminator_penalty("irmv1"), self._penalty_options()
+            measure, options = discriminator_penalty("irmv1"), PenaltyOptions()
             for e in range(self._settings):
                 own = slice(e, e + 1)
                 correct = torch.stack([logits[e, 0] < 0, logits[e, 1] > 0]).float()
@@ -439,7 +437,7 @@ class AIRL:
                 )
         return found
 
-    def _penalty_options(self, weight: float = 1.0) -> PenaltyOptions:
+    def _penalty_options(self, weight: float) -> PenaltyOptions:
         return PenaltyOptions(
             self.config.penalty_scaling, self.config.penalty_estimate == "unbiased", weight
         )

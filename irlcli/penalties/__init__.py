@@ -26,7 +26,8 @@ class Samples(NamedTuple):
 
     Attributes:
         logits: of the discriminator [E, 2, B]: E risks, label 0 is the policy and 1 the expert.
-        f: their learned part [E, 2, B], f = logits + log pi(a|s).
+        f: their learned part [E, 2, B], f = logits + log pi(a|s), or the logits
+            themselves where those have no log pi (``airl.logit = "f"``).
         risks: the cross-entropy of each risk [E].
         weights: of the risks in the loss [E]. Only group-dro uses them; to the other penalties all
             risks are equal.

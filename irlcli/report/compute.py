@@ -106,7 +106,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     Columns: ``row``, ``agent``, ``measure``, ``setting``; ``seeds`` and ``seeds_wanted``; ``mean``,
     ``deviation`` (n - 1), ``low`` and ``high`` (95 % bootstrap interval) and ``iqm`` of the true
     return over seeds; ``progress``, its mean; ``complete``, whether all evaluations exist;
-    ``mixed``, whether the runs behind them differ in code or libraries; ``of_expert``, the mean
+    ``partial``, whether a seed in the mean lacks some; ``mixed``, whether the runs behind them differ in code or libraries; ``of_expert``, the mean
     over that of the training settings' experts, in distribution; ``imitated``, see
     :func:`imitates`; ``between_retrainings``, see :func:`between_retrainings`.
     """
@@ -140,6 +140,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "between_retrainings": between_retrainings(points, row.name, agent, measure),
                     "progress": None if math.isnan(progress) else float(progress),
                     "complete": all(c.run for c in planned),
+                    "partial": len(whole_sample(p, points, row.name, agent, measure)) < s.n,
                     "mixed": is_mixed(origins(p, evaluations(planned))),
                 }
             )
@@ -238,7 +239,8 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             if both.empty or math.isnan(random):
                 continue
             verdicts = [_verdict(r, random) for r in both.itertuples()]
-            means = (float(both[n].mean()) for n in ("learned_return", "learned_return_expert"))
+            scores = both[["learned_return", "learned_return_expert"]]
+            means = map(float, scores.groupby(both["seed"]).mean().mean())
             counts = len(both) - verdicts.count("retrained"), verdicts.count("wrong reward")
             seeds = both["seed"].nunique()
             found.append((row.name, method, seeds, len(both), *means, *counts))

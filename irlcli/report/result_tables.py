@@ -163,7 +163,7 @@ def _cell(cell: Any) -> str:
         text += f" ± {cell.deviation:.1f}"
     if cell.seeds < cell.seeds_wanted:
         text += f" ({cell.seeds}/{cell.seeds_wanted})"
-    elif not cell.complete:
+    if cell.partial:
         text += " (part)"
     if failed_to_imitate(cell):
         text += " †"
@@ -283,7 +283,7 @@ def comparisons(p: Parameters, found: pd.DataFrame) -> Table:
                 "" if printed is None else p_value(_paper_p(printed, equal_variances=True)),
                 p_value(r.p_rank),
                 number(r.improvement, 2),
-                r.why or remark,
+                "; ".join(filter(None, (r.why, remark))),
             ]
         )
     columns = ["row", "measure", "difference of", "means", "Welch", "Welch, Holm", "paired"]

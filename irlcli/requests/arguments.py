@@ -1,8 +1,8 @@
 """Text of options as settings, counts and numbers."""
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 
@@ -28,6 +28,46 @@ if TYPE_CHECKING:
     from irlcli.store import Store
 
 PENALTY_WEIGHT = "airl.penalty_weight"
+
+
+class Where(NamedTuple):
+    """``--ood`` or ``--intervention`` as given, and the texts of ``--setting``."""
+
+    text: str | None
+    kind: Literal["id", "ood"]
+    several: Sequence[str]
+
+    @property
+    def given(self) -> bool:
+        """Whether any setting is named."""
+        return self.text is not None or bool(self.several)
+
+    def settings(
+        self, env: str, config: "Config", origin: "Reward | Policy | None" = None
+    ) -> list[Setting]:
+        """The named settings.
+
+        Raises:
+            UsageError: malformed, named twice, or with other observations than ``origin``'s.
+        """
+        settings = [parse_setting(env, text) for text in self.several]
+        if origin is not None:
+            check_observed(env, origin.settings, settings)
+        if self.text is not None:
+            settings = [*named_settings(env, config, self.text, self.kind, origin), *settings]
+        check_distinct("the command", settings)
+        return settings
+
+
+def where(ood: str | None, intervention: str | None, several: Sequence[str]) -> Where:
+    """The settings that the options name.
+
+    Raises:
+        UsageError: ``--ood`` and ``--intervention`` are both given.
+    """
+    if ood is not None and intervention is not None:
+        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    return Where(intervention, "id", several) if ood is None else Where(ood, "ood", several)
 
 
 def named_settings(
@@ -90,32 +130,13 @@ def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
         raise UsageError(error.message, error.hint + _listed(config, knob, kind)) from None
 
 
-def with_several(
-    env: str,
-    listed: Sequence[Setting],
-    texts: Sequence[str],
-    origin: "Reward | Policy | None" = None,
-) -> list[Setting]:
-    """The settings ``listed``, and one for each of the ``texts`` of ``--setting``.
-
-    Raises:
-        UsageError: malformed, named twice, or with other observations than ``origin``'s.
-    """
-    added = [parse_setting(env, text) for text in texts]
-    if origin is not None:
-        check_observed(env, origin.settings, added)
-    settings = [*listed, *added]
-    check_distinct("the command", settings)
-    return settings
-
-
 def warn_of_seen(
     console: "RunConsole", settings: Sequence[Setting], origin: "Reward | Policy", ref: str
 ) -> None:
     """Warn of every setting beside ``--ood`` that ``origin``, which ``ref`` names, was trained in."""
     for setting in settings:
         if str(setting) in origin.settings:
-            console.warn(f"{setting} is not unseen: {ref!r} was trained in it")
+            console.warn(f"{setting} is not held out: {ref!r} was trained in it")
 
 
 def _listed(config: "Config", knob: str, kind: Literal["id", "ood"]) -> str:
@@ -307,8 +328,10 @@ def method_fields(
     return found
 
 
-def check_weighted(name: str, penalty: str, penalty_weight: float | None) -> None:
-    """Refuse ``--penalty-weight`` for a method without a penalty.
+def check_weighted(
+    name: str, methods: Iterable[str], penalty: str, penalty_weight: float | None
+) -> None:
+    """Refuse ``--penalty-weight`` for a method without a penalty; ``methods`` are the learner's.
 
     Raises:
         UsageError: the weight would have no effect.
@@ -316,7 +339,7 @@ def check_weighted(name: str, penalty: str, penalty_weight: float | None) -> Non
     if penalty_weight is not None and penalty == "none":
         from irlcli.methods import METHODS
 
-        penalised = [m.name for m in METHODS.values() if m.penalty != "none"]
+        penalised = [method for method in methods if METHODS[method].penalty != "none"]
         raise UsageError(
             f"--penalty-weight {penalty_weight:g}: {name} has no penalty",
             f"omit --penalty-weight; methods with a penalty: {', '.join(penalised)}",

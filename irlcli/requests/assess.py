@@ -33,6 +33,7 @@ def assess(
     reward: str,
     ood: str | None,
     intervention: str | None,
+    setting: Sequence[str],
     demos: str | None,
     episodes: int | None,
     env: str | None,
@@ -46,17 +47,14 @@ def assess(
         UsageError: contradictory or unsuitable options.
         NotFound: no such reward or demonstrations.
     """
-    if ood is not None and intervention is not None:
-        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    where = arguments.where(ood, intervention, setting)
     known = arguments.env_name(env)
     source, origin = references.tensor_file(session.store, reward, "reward")
     arguments.check_env(reward, origin.env, known)
     config = session.config(origin.env, {"evaluation.episodes": episodes})
-    settings: Sequence[Setting] = [parse_setting(origin.env, text) for text in origin.settings]
-    if ood is not None:
-        settings = arguments.named_settings(origin.env, config, ood, "ood", origin)
-    elif intervention is not None:
-        settings = arguments.named_settings(origin.env, config, intervention, "id", origin)
+    settings = [parse_setting(origin.env, text) for text in origin.settings]
+    if where.given:
+        settings = where.settings(origin.env, config, origin)
     finder = bank.Finder(session.store, session.runner().lookup(), config)
     shown, cloned = finder.demonstrations(source), origin.settings
     if demos is not None:

@@ -2,12 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 
-from irlcli.configs import Config
 from irlcli.data.descriptions import Collected
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
 from irlcli.experiments.references import output, recorded
-from irlcli.interventions import Setting, parse_setting, without_cue
+from irlcli.interventions import parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import collect_experts as collect_stage
@@ -40,7 +39,7 @@ def collect_experts(
         )
     env = resolve(env).name
     config = session.config(env)
-    settings = _settings(env, config, intervention, setting)
+    settings = arguments.where(None, intervention, setting).settings(env, config)
     listed = config.interventions.get(intervention or "")
     counts: Sequence[int] = ()
     if episodes is not None:
@@ -89,16 +88,6 @@ def import_demonstrations(
             "environment",
         )
     env = resolve(env).name
-    settings = _settings(env, session.config(env), intervention, setting)
+    settings = arguments.where(None, intervention, setting).settings(env, session.config(env))
     form, found = recorded(recordings)
     return import_stage.request(form, found, env, settings, setting_column, cut)
-
-
-def _settings(
-    env: str, config: Config, intervention: str | None, setting: Sequence[str]
-) -> list[Setting]:
-    """The settings that are named."""
-    named: Sequence[Setting] = ()
-    if intervention is not None:
-        named = arguments.named_settings(env, config, intervention, "id")
-    return arguments.with_several(env, named, setting)

@@ -1,12 +1,11 @@
 """``evaluate``: returns of policies, experts and baselines."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from irlcli import labels
-from irlcli.data.descriptions import Evaluation, Policy
+from irlcli.data.descriptions import Evaluation
 from irlcli.data.descriptions import Reward as RewardDescription
-from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.experiments import references
 from irlcli.interventions import Setting, check_observed, parse_setting
@@ -15,35 +14,6 @@ from irlcli.requests.session import Session, StageSession
 from irlcli.stages import evaluate as stage
 from irlcli.stages.base import From, Request, Source
 from irlcli.store import Artefact
-
-if TYPE_CHECKING:
-    from irlcli.configs import Config
-
-
-class _Where(NamedTuple):
-    """``--ood`` or ``--intervention`` as given, and the texts of ``--setting``."""
-
-    text: str | None
-    kind: Literal["id", "ood"]
-    several: Sequence[str]
-
-    @property
-    def given(self) -> bool:
-        """Whether any setting is named."""
-        return self.text is not None or bool(self.several)
-
-    def settings(
-        self, env: str, config: "Config", origin: RewardDescription | Policy | None
-    ) -> list[Setting]:
-        """The named settings.
-
-        Raises:
-            UsageError: malformed, or with other observations than ``origin``'s.
-        """
-        named: Sequence[Setting] = ()
-        if self.text is not None:
-            named = arguments.named_settings(env, config, self.text, self.kind, origin)
-        return arguments.with_several(env, named, self.several, origin)
 
 
 class _Reward(NamedTuple):
@@ -91,14 +61,10 @@ def evaluate(
             f"{given or 'no'} agents are named, but one is needed",
             "give one of --policy REF, --expert, --random, --idle",
         )
-    if ood is not None and intervention is not None:
-        raise UsageError("--ood and --intervention both name settings", "give one of them")
+    where = arguments.where(ood, intervention, setting)
     if trained_in is not None and not expert:
         raise UsageError("--trained-in selects experts, but --expert is missing", "add --expert")
     env = arguments.env_name(env)
-    where = _Where(intervention, "id", setting)
-    if ood is not None:
-        where = _Where(ood, "ood", setting)
     scored_by = None
     if reward is not None:
         source, origin = references.tensor_file(session.store, reward, "reward")
@@ -128,7 +94,7 @@ def measured(session: Session, artefact: Artefact) -> tuple[Evaluation, dict[str
 def _of_policy(
     session: StageSession,
     policy: str,
-    where: _Where,
+    where: arguments.Where,
     env: str | None,
     episodes: int | None,
     seed: int,
@@ -169,7 +135,7 @@ def _of_agent(
     session: StageSession,
     agent: Literal["expert", "random", "idle"],
     trained_in: str | None,
-    where: _Where,
+    where: arguments.Where,
     env: str | None,
     episodes: int | None,
     seed: int,
@@ -177,8 +143,6 @@ def _of_agent(
 ) -> list[Request]:
     if scored_by is not None:
         env = scored_by.origin.env
-    if env is not None:
-        environment(env)
     if env is None or not where.given:
         missing = "--env ENV " if env is None else ""
         raise UsageError(

@@ -4,7 +4,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from irlcli.configs import Config
     from irlcli.experiments.runner import RunConsole, Runner
     from irlcli.stages.base import Request
+    from irlcli.store.sources import Place
 
 
 def check_path(path: Path, option: str) -> None:
@@ -75,7 +76,7 @@ class Session:
             kind = "directory" if resolved.path.is_dir() else "file"
             raise NotFound(
                 f"{ref!r} is a {kind}, not an artefact of the store {self.store.root}",
-                f"`{shlex.join(['irl', 'ls', *self.store.option])}` lists the artefacts",
+                self.store.listing,
             )
         return resolved.artefact
 
@@ -125,9 +126,9 @@ class StageSession(Session):
         self, env: str, flags: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
     ) -> "Config":
         """The config of ``env`` under this session's profile and overrides, then ``overrides``."""
-        from irlcli.configs import lacks_profile, load_config
+        from irlcli.configs import file_without_profile, load_config
 
-        source = lacks_profile(env, self.profile)
+        source = file_without_profile(env, self.profile)
         if source and source not in self._warned:
             self._warned.add(source)
             self.console.warn(
@@ -147,7 +148,8 @@ class StageSession(Session):
         configs = self.config_words()
         if self.profile == DEFAULT_PROFILE:
             configs = configs[2:]
-        return shlex.join(["irl", *words, *configs, *self.store.option])
+        sources = [word for source in self.sources for word in ("--from", str(source))]
+        return shlex.join(["irl", *words, *configs, *self.store.option, *sources])
 
     def runner(self) -> "Runner":
         """A runner on the session's store and those to copy from.
@@ -157,19 +159,23 @@ class StageSession(Session):
         """
         from irlcli.experiments.runner import Runner
 
-        sources = []
-        if self.sources:
-            from irlcli.store.sources import open_sources
-
-            sources = open_sources(self.sources, self.console.warn)
         return Runner(
             self.store,
             self.console,
             self.wait,
             self.command,
             workers=self.workers,
-            sources=sources,
+            sources=self._places,
         )
+
+    @cached_property
+    def _places(self) -> "list[Place]":
+        """The stores to copy from. They are opened once: a remote one remembers what it fetched."""
+        if not self.sources:
+            return []
+        from irlcli.store.sources import open_sources
+
+        return open_sources(self.sources, self.console.warn)
 
     def run(self, requests: Sequence["Request"], name: str | None = None) -> list[Artefact]:
         """The artefacts of ``requests``, in this order; the first one gets the name.

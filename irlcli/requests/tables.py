@@ -14,8 +14,17 @@ from irlcli.requests.session import StageSession, check_path
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.status import Step
-    from irlcli.experiments.tables import Table
+    from irlcli.experiments.tables import Kind, Table
 
+# The sections of a config that the steps of each kind of table read.
+_SECTIONS: "dict[Kind, set[str]]" = {
+    "comparison": {
+        *("expert", "demonstrations", "airl", "transfer", "evaluation", "clone", "assessment")
+    },
+    "experts": {"expert", "evaluation"},
+    "figure2": {"gridworld", "maxent", "figure2"},
+    "control": {"control"},
+}
 # In a name, which may have 100 characters in all.
 _LONGEST_PART = 50
 
@@ -105,6 +114,9 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     selection = Selection(tag, candidates, until, choice.only, listing)
     plan = Plan(table, selection, session.config, session.runner().lookup())
     _check_weights(session, table)
+    if choice.only is None:
+        # The processes that make one step each would repeat it.
+        _warn_of_unread(session, table)
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
@@ -132,6 +144,12 @@ def _check_weights(session: StageSession, table: "Table") -> None:
             f"{given[-1]} does not apply to {', '.join(listed)}: {table.name} lists their lambda",
             "omit them from --methods, or change the table with --experiments",
         )
+
+
+def _warn_of_unread(session: StageSession, table: "Table") -> None:
+    for item in session.overrides:
+        if item.partition(".")[0].strip() not in _SECTIONS[table.kind]:
+            session.console.warn(f"no step of {table.name} reads --set {item}")
 
 
 def _weights_in(tree: Mapping[str, Any], knobs: Set[str]) -> Iterator[str]:

@@ -8,6 +8,7 @@ from irlcli.experiments.references import demonstrations
 from irlcli.experiments.runner import source_of
 from irlcli.interventions import check_tabular, parse_setting
 from irlcli.methods import METHODS
+from irlcli.penalties import maxent_methods
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import choose_penalty as choice
@@ -63,11 +64,11 @@ def train_airl(
     }
     config = session.config(env, flags)
     airl = config.airl_of(settings[0])
-    arguments.check_weighted(airl_stage.name(airl), airl.penalty, penalty_weight)
-    # A bad option must fail before the choice of lambda, which takes long.
-    airl_stage.request(source, env, settings, airl, seed)
+    arguments.check_weighted(airl_stage.name(airl), METHODS, airl.penalty, penalty_weight)
     basis: dict[str, Source] = {}
     if choose_penalty is not None:
+        # A bad option must fail before the choice of lambda, which takes long.
+        airl_stage.request(source, env, settings, airl, seed)
         if penalty_weight is not None:
             raise UsageError(
                 "--penalty-weight and --choose-penalty both set lambda", "give one of them"
@@ -124,7 +125,8 @@ def train_maxent(
     }
     config = session.config(env, flags)
     maxent = config.maxent
-    arguments.check_weighted(f"{maxent.grouping} MaxEnt", maxent.penalty, penalty_weight)
+    name = f"{maxent.grouping} MaxEnt"
+    arguments.check_weighted(name, maxent_methods(), maxent.penalty, penalty_weight)
     settings = [parse_setting(env, text) for text in texts]
     unseen = unseen_settings(env, config)
     return maxent_stage.request(source, env, settings, unseen, maxent, seed)

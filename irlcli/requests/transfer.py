@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
-from irlcli.interventions import Setting
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import transfer as stage
@@ -45,12 +44,7 @@ def transfer(
     source, origin = references.tensor_file(session.store, reward, "reward")
     arguments.check_env(reward, origin.env, env)
     config = session.config(origin.env, {"transfer.algorithm": algorithm})
-    named: Sequence[Setting] = ()
-    if intervention is not None:
-        named = arguments.named_settings(origin.env, config, intervention, "id", origin)
-    elif ood is not None:
-        named = arguments.named_settings(origin.env, config, ood, "ood", origin)
-    settings = arguments.with_several(origin.env, named, setting, origin)
+    settings = arguments.where(ood, intervention, setting).settings(origin.env, config, origin)
     if len(settings) != 1:
         names = ", ".join(str(setting) for setting in settings)
         raise UsageError(

@@ -6,7 +6,8 @@ Importing it loads neither torch nor stable-baselines3.
 from typing import Any
 
 # Name to module and class, one line each. A class takes (worlds, config, total_steps, seed, purpose)
-# and is a :class:`irlcli.rl.loop.Trainer`. All but SAC are configured by ``transfer.ppo``.
+# and, for --start student, ``keep_moments``; it is a :class:`irlcli.rl.loop.Trainer`. All but SAC are
+# configured by ``transfer.ppo``.
 ALGORITHMS = {
     "ppo": "irlcli.rl.ppo:PPOTrainer",
     "sac": "irlcli.rl.sac:SACTrainer",

@@ -14,6 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from irlcli.configs import ChallengerConfig
+from irlcli.errors import StageFailed
 from irlcli.rl.policy import Policy
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.worlds import Worlds
@@ -70,11 +71,21 @@ class Challengers:
         return self._learner.challenger_rewards(rollout)
 
     def train_round(self, index: int) -> list[Rollout]:
-        """The rollouts of the challengers of round ``index``, updated on each of them."""
+        """The rollouts of the challengers of round ``index``, updated on each of them.
+
+        Raises:
+            StageFailed: a challenger's parameters stopped being finite.
+        """
         life, age = divmod(index, self._config.life)
         if life != self._life:
             self._life, self._trainers = life, self._born(life)
-        rollouts = [trainer.train_round(age, self) for trainer in self._trainers]
+        try:
+            rollouts = [trainer.train_round(age, self) for trainer in self._trainers]
+        except StageFailed as error:
+            raise StageFailed(
+                f"the challenger that began in round {index - age}: {error.message}",
+                f"{error.hint}; it learns as airl.challenger.ppo says",
+            ) from error
         return [side_by_side(parts) for parts in zip(*rollouts, strict=True)]
 
     def state_dict(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ Experts, retrained policies and adversarial students differ only in what they pa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -212,7 +212,10 @@ class Training:
             ]
             self.rows += rows
             self.rounds_done = index + 1
-            for message in self._errors(index, [*rollouts, *challenge]):
+            for message in (
+                *self._errors(index, rollouts, "world"),
+                *self._errors(index, challenge, "the challenger's world"),
+            ):
                 warn(message)
             after_round(self, rows)
         self.selector.restore(self.trainer.policy)
@@ -230,15 +233,15 @@ class Training:
             for row in episode_rows(index, self.trainer.steps, challenge, self.settings)
         ]
 
-    def _errors(self, index: int, rollouts: Sequence[Rollout]) -> list[str]:
+    def _errors(self, index: int, rollouts: Sequence[Rollout], whose: str) -> Iterator[str]:
         """The worlds whose episode stopped on an error."""
-        settings = world_settings(rollouts[0].terminated.shape[1], len(self.settings))
-        return [
-            f"{self.settings[settings[world]]}, world {world}, round {index}: {error}; the episode "
-            "ended there and training continues"
-            for rollout in rollouts
-            for world, error in rollout.errors
-        ]
+        for rollout in rollouts:
+            settings = world_settings(rollout.terminated.shape[1], len(self.settings))
+            for world, error in rollout.errors:
+                yield (
+                    f"{self.settings[settings[world]]}, {whose} {world}, round {index}: {error}; the "
+                    "episode ended there and training continues"
+                )
 
     def state_dict(self) -> State:
         """What a resumed run needs, besides the rows."""

@@ -5,11 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import torch
-from stable_baselines3.common.distributions import (
-    Distribution,
-    MultiCategoricalDistribution,
-    SquashedDiagGaussianDistribution,
-)
+from stable_baselines3.common.distributions import Distribution, MultiCategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.sac.policies import Actor
@@ -97,7 +93,9 @@ class Policy:
 
 
 class SquashedPolicy(Policy):
-    """SAC's actor: a Gaussian squashed by tanh into the action bounds. Only PPO's are cloned."""
+    """SAC's actor: a Gaussian squashed by tanh into the action bounds. It only acts: no learner asks for
+    its likelihoods.
+    """
 
     network: Actor  # type: ignore[assignment]
 
@@ -109,23 +107,6 @@ class SquashedPolicy(Policy):
         with torch.no_grad():
             actions = self.network(torch.as_tensor(observations), deterministic)
             return self.network.unscale_action(actions.numpy())
-
-    def log_prob(
-        self, observations: torch.Tensor, actions: torch.Tensor, gradient: bool = False
-    ) -> torch.Tensor:
-        """log pi(a|s) [B] for observations [B, D] and actions [B, A]."""
-        with torch.set_grad_enabled(gradient):
-            mean, log_std, _ = self.network.get_action_dist_params(observations)
-            squashed = self.network.action_dist
-            assert isinstance(squashed, SquashedDiagGaussianDistribution)
-            found = squashed.proba_distribution(mean, log_std)
-            low, high = (torch.as_tensor(b) for b in self._bounds)
-            scaled = 2.0 * (actions - low) / (high - low) - 1.0
-            return found.log_prob(scaled) - torch.log((high - low) / 2.0).sum()
-
-    @property
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.network.action_space.low, self.network.action_space.high
 
 
 def _torch_distribution(found: Distribution) -> torch.distributions.Distribution:

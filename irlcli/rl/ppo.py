@@ -1,5 +1,7 @@
 """PPO (Schulman et al. 2017), as stable-baselines3 implements it, trained in seeded rounds.
 
+Only Adam's eps differs from stable-baselines3's by default, see :class:`irlcli.configs.PPOConfig`.
+
 A round seeds every generator from (purpose, seed, round), starts fresh episodes, collects one or
 more rollouts and updates on each. Only the network, its optimiser, running moments and a step
 count outlive a round. So a run resumed from any round's checkpoint equals an uninterrupted one
@@ -14,11 +16,13 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 import torch
+from msgspec import UNSET
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 
 from irlcli.configs import PPOConfig
+from irlcli.configs.schema import ADAM_EPS
 from irlcli.errors import StageFailed
 from irlcli.networks import ACTIVATIONS, all_finite
 from irlcli.rl.policy import NormalisingExtractor, Policy, extractor
@@ -233,8 +237,12 @@ def _policy_kwargs(ppo: PPOConfig) -> dict[str, Any]:
         "ortho_init": ppo.ortho_init,
         "log_std_init": ppo.log_std_init,
         "features_extractor_class": extractor(ppo.normalise_observations),
-        # One kernel for all parameters: the optimiser's step is most of a small network's update.
-        "optimizer_kwargs": {"fused": True},
+        # Fused is one kernel for all parameters: the optimiser's step is most of a small network's
+        # update.
+        "optimizer_kwargs": {
+            "fused": True,
+            "eps": ADAM_EPS if ppo.adam_eps is UNSET else ppo.adam_eps,
+        },
     }
 
 

@@ -79,7 +79,7 @@ def run(job: Job) -> None:
     from irlcli.data.demonstrations import read_demonstrations
     from irlcli.data.outputs import write_policy
     from irlcli.errors import IntegrityError
-    from irlcli.learners.actions import ActionView
+    from irlcli.learners.actions import ActionView, check_fit
     from irlcli.learners.cloning import clone
     from irlcli.rl.ppo import PPOTrainer
     from irlcli.rl.worlds import action_space, make_worlds, observation_size
@@ -99,10 +99,10 @@ def run(job: Job) -> None:
         size = observation_size(worlds.observation_space)
         view = ActionView(p.actions, space)
         data = view.of(transitions(episodes, p.environment.max_episode_steps))
-        fits = (data.actions.dtype == "int64") == space.discrete
-        fits = fits and data.actions.shape[1:] == space.shape
-        if data.observations.shape[1] != size or not fits:
-            raise IntegrityError(f"the demonstrations do not fit {env} {setting}")
+        try:
+            check_fit(data, size, space)
+        except ValueError as error:
+            raise IntegrityError(f"{env} {setting}: {error}") from None
         clone(trainer, data, view, p.clone.epochs, p.seed)
     write_policy(
         job.output,

@@ -97,6 +97,13 @@ class Store:
         """The words that name this store on a command line; none if it is the default."""
         return self._layout.option
 
+    @property
+    def listing(self) -> str:
+        """The command that lists the artefacts, as the end of a hint."""
+        import shlex
+
+        return f"`{shlex.join(['irl', 'ls', *self.option])}` lists the artefacts"
+
     # Reading
 
     def find(self, key: str) -> Artefact | None:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from falling import Falling
 
 from irlcli.configs import SACConfig
@@ -135,20 +134,6 @@ def test_a_saved_policy_acts_as_before():
     )
     (trajectory,) = roll_out("reacher", SETTINGS[0], policy, 1, seed=0, purpose="test")
     assert np.abs(trajectory.actions).max() <= 1.0
-
-
-def test_log_pi_is_the_density_of_the_squashed_actions():
-    """In one dimension it integrates to one over the bounds."""
-    policy = make_trainer().policy
-    first = torch.linspace(-0.999, 0.999, 2001)
-    observation = torch.full((1, 9), 0.3)
-    mean, log_std, _ = policy.network.get_action_dist_params(observation)
-    actions = torch.stack([first, torch.zeros_like(first)], -1)
-    density = policy.log_prob(observation.expand(2001, -1), actions).exp()
-    # What is left of the second dimension: a Gaussian at atanh(0) = 0.
-    second = torch.distributions.Normal(mean[0, 1], log_std[0, 1].exp()).log_prob(torch.zeros(()))
-    total = float((torch.trapezoid(density, first) / second.exp()).detach())
-    assert total == pytest.approx(1.0, abs=0.02)
 
 
 def test_it_climbs_a_reward():

@@ -183,7 +183,7 @@ def test_a_training_setting_is_named_as_for_evaluations(runs, irl):
     assert "warning" not in by_value.err
     as_unseen = irl(*own, "--ood", "friction=2:0.6:0.6")
     assert as_unseen.out == by_value.out
-    warned = "warning: friction=2:0.6:0.6 is not unseen: 'airl' was trained in it"
+    warned = "warning: friction=2:0.6:0.6 is not held out: 'airl' was trained in it"
     assert warned in as_unseen.err
     assert "warning" not in irl(*own, "--ood", "friction").err
     score = ["evaluate", "--policy", "airl", *common(runs), "--dry-run"]
