@@ -121,6 +121,8 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             s = summarise(values["true_return"].tolist())
             low, high = s.interval or (None, None)
             progress = values["progress"].mean() if len(values) else math.nan
+            # Baselines have one sample and no seed.
+            sampled = {None, *values.index}
             planned = [
                 c for c in p.cells if (c.row, c.agent, c.measure) == (row.name, agent, measure)
             ]
@@ -140,7 +142,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "between_retrainings": between_retrainings(points, row.name, agent, measure),
                     "progress": None if math.isnan(progress) else float(progress),
                     "complete": all(c.run for c in planned),
-                    "partial": len(whole_sample(p, points, row.name, agent, measure)) < s.n,
+                    "partial": any(not c.run and c.seed in sampled for c in planned),
                     "mixed": is_mixed(origins(p, evaluations(planned))),
                 }
             )

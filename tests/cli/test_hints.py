@@ -128,8 +128,8 @@ def test_what_a_reference_may_be_is_in_the_hint(irl, store_copy):
     assert "irl train-airl" in hint(store_copy.airl)
 
 
-def session(store, profile="standard", overrides=()):
-    fixed = {"file": None, "sources": (), "dry_run": True, "wait": True, "workers": 1}
+def session(store, profile="standard", overrides=(), sources=()):
+    fixed = {"file": None, "sources": sources, "dry_run": True, "wait": True, "workers": 1}
     return StageSession(
         store, False, profile=profile, overrides=overrides, quiet=True, tensorboard=None, **fixed
     )
@@ -142,6 +142,7 @@ def test_a_suggested_command_repeats_what_is_no_default(tmp_path, monkeypatch):
     assert session("other").suggestion("ls") == "irl ls --store other"
     changed = session("runs", "smoke", ["airl.bc_epochs=3"])
     assert changed.suggestion("ls") == "irl ls --profile smoke --set airl.bc_epochs=3"
+    assert session("runs", sources=["zoo"]).suggestion("ls") == "irl ls --from zoo"
     monkeypatch.setenv("IRL_STORE", "other")
     assert session("other").suggestion("ls") == "irl ls"
     assert session("runs").suggestion("ls") == "irl ls --store runs"
@@ -231,6 +232,24 @@ def test_a_field_that_no_stage_of_the_command_reads_is_named(irl, smoke_store, l
     done = irl(*line.split(), "--set", item, *SMOKE, "--store", smoke_store.path, "--dry-run")
     assert done.code == 0
     assert (f"warning: no stage of this command reads --set {item}" in done.err) == unread
+
+
+@pytest.mark.parametrize(
+    ("table", "item", "unread"),
+    [
+        ("control", "airl.penalty_weight=3", True),
+        ("figure2", "airl.bc_epochs=3", True),
+        ("experts", "transfer.ceiling=0.5", True),
+        ("table1", "maxent.l2=1", True),
+        ("table1", "airl.bc_epochs=3", False),
+        ("figure2", "maxent.iterations=9", False),
+    ],
+)
+def test_a_field_that_no_step_of_a_table_reads_is_named(irl, tmp_path, table, item, unread):
+    line = ["plan", table, "--set", item, "--tag", "x", *SMOKE, "--store", tmp_path / "runs"]
+    done = irl(*line)
+    assert done.code == 0, done.err
+    assert (f"warning: no step of {table} reads --set {item}" in done.err) == unread
 
 
 def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from irlcli.configs import PROFILES, Config, load_config
-from irlcli.configs.relevance import relevant_airl
+from irlcli.configs import PROFILES, Config, PPOConfig, load_config
+from irlcli.configs.relevance import relevant_airl, relevant_ppo
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
@@ -161,6 +161,29 @@ def test_however_written_it_is_one_value_and_so_one_key(toml, text):
     from_file = load_config(LANDER, file=toml(f"[airl]\npenalty_weight = {text}"))
     forms = {canonical_json(msgspec.to_builtins(s)) for s in (expected, from_set, from_file)}
     assert len(forms) == 1
+
+
+@pytest.mark.parametrize(
+    ("item", "flags"),
+    [
+        ("airl.penalty=vrex", {"airl.penalty": "irmv1"}),
+        (" airl.dropout = 0.2", {"airl.dropout": 0.5}),
+        ("evaluation.episodes=7", {"evaluation.episodes": 5, "airl.penalty": None}),
+    ],
+)
+def test_a_field_that_an_option_sets_to_another_value_is_refused(item, flags):
+    """It would be ignored."""
+    field = item.partition("=")[0].strip()
+    error = refused(overrides=[item], flags=flags)
+    assert field in error.message and f"--set {field}" in error.hint
+    same = f"{field}={flags[field]}"
+    assert load_config(LANDER, overrides=[same], flags=flags) == load_config(LANDER, flags=flags)
+
+
+def test_names_in_sections_of_one_knob_are_checked(toml):
+    for text in ("airl]\npenalty = 'nope'", "transfer]\nalgorithm = 'nope'"):
+        error = refused("smoke", toml(f"[interventions.bounce.{text}"))
+        assert "interventions.bounce." in error.message and "nope" in error.message
 
 
 # --set
@@ -524,3 +547,20 @@ def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):
     assert "airl.hidden" in refused(file=toml('[airl]\nhidden = "none"')).message
     whole = toml('[interventions.bounce]\nid = ["0.1"]\ntransfer = "none"')
     assert "'none'" in refused(file=whole).message
+
+
+def test_an_eps_that_is_the_default_is_no_other_key():
+    plain = relevant_ppo(PPOConfig(), True, "expert.ppo")
+    assert relevant_ppo(PPOConfig(adam_eps=1e-8), True, "expert.ppo") == plain
+    assert relevant_ppo(PPOConfig(adam_eps=1e-5), True, "expert.ppo") != plain
+    assert {load_config(LANDER, p).expert.ppo.adam_eps for p in ("standard", "paper")} == {
+        msgspec.UNSET,
+        1e-5,
+    }
+
+
+def test_a_cap_on_the_noise_of_gsde_is_refused():
+    """gSDE's log standard deviations are of the features' weights, not of the actions."""
+    capped = PPOConfig(use_sde=True, log_std_max=-1.0)
+    with pytest.raises(UsageError, match=r"expert\.ppo\.log_std_max"):
+        relevant_ppo(capped, False, "expert.ppo")

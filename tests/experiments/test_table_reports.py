@@ -464,7 +464,7 @@ def test_an_intervention_without_held_out_values_has_experts(irl, table_store, t
     # It cannot be a row of a comparison.
     refused = irl("plan", "table1", *ROW, *common)
     assert refused.code == 2
-    assert "lunar-lander.engine-power has 2 settings to train in and 0 held out" in refused.err
+    assert "lunar-lander.engine-power: settings to train in: 2, held out: 0" in refused.err
 
 
 def test_baselines_alone_make_a_report(irl, tmp_path):
@@ -567,3 +567,24 @@ def test_make_passes_its_variables_on():
         smoke = commands(f"report-{table}", "PROFILE=smoke")[0]
         assert f"--name {table}-smoke.{table} " in smoke
     assert " demo-smoke.lunar-lander." in commands("demo", "PROFILE=smoke")[-1]
+
+
+def test_what_another_store_holds_is_not_called_missing(irl, table_store, tmp_path):
+    """The report reads one store only, and says where the rest is."""
+    place = [
+        *ROW,
+        "--store",
+        tmp_path / "runs",
+        "--from",
+        table_store,
+        "--profile",
+        "smoke",
+        *SMALL,
+    ]
+    refused = irl("report", "table1", *place)
+    assert refused.code == 3 and f"--from {table_store}" in refused.err
+    step = "x.lunar-lander.engine-power.idle-returns"
+    one = irl("run", "table1", *place, "--tag", "x", "--only", step)
+    assert one.code == 0, one.err
+    done = irl("report", "table1", *place)
+    assert done.code == 0 and f"is in {table_store}" in done.err

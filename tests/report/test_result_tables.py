@@ -1,5 +1,6 @@
 """The tables of a report, and tables as Markdown and LaTeX."""
 
+import msgspec
 import pytest
 from report_examples import BOUNCE, POWER, column, complete, example, metrics, scored, table
 
@@ -7,6 +8,7 @@ from irlcli.methods import METHODS
 from irlcli.report.agents import colours, title
 from irlcli.report.build import build
 from irlcli.report.lineage import duration
+from irlcli.report.parameters import Cell
 from irlcli.report.tables import latex_table, latex_text, markdown_table
 
 
@@ -37,6 +39,15 @@ def test_a_student_that_did_not_imitate_is_marked():
 def test_missing_seeds_are_counted():
     values = complete() | {(BOUNCE, "irm", "transfer"): [5.0, None, None]}
     assert table(build(*example(values), {}, {}), "Transfer").rows[0][3] == "5.0 (1/3)"
+
+
+def test_a_mean_over_some_of_the_settings_is_marked_beside_the_missing_seeds():
+    values = complete() | {(BOUNCE, "irm", "id"): [5.0, None, None]}
+    parameters, points = example(values)
+    lacking = Cell(BOUNCE, "irm", "id", 0, place="another", why="evaluate has not run")
+    parameters = msgspec.structs.replace(parameters, cells=(*parameters.cells, lacking))
+    found = table(build(parameters, points, {}, {}), "In distribution").rows[0][3]
+    assert found.startswith("5.0 (1/3) (part)")
 
 
 def test_learned_returns_stand_side_by_side():

@@ -38,6 +38,11 @@ def same(a, b):
     return to_bytes(a.state_dict()) == to_bytes(b.state_dict())
 
 
+@pytest.mark.parametrize(("changes", "eps"), [({}, 1e-8), ({"adam_eps": 1e-5}, 1e-5)])
+def test_adams_eps_is_that_of_the_config(changes, eps):
+    assert make_trainer(**changes).model.policy.optimizer.param_groups[0]["eps"] == eps
+
+
 def test_rollouts_hold_true_successors_and_the_sampling_policys_log_probs():
     trainer = make_trainer(limit=50)
     seen = []
