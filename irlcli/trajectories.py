@@ -16,7 +16,7 @@ class Trajectory:
 
     Attributes:
         observations: [T + 1, D] float32, the final one included.
-        actions: [T] int64 or [T, A] float32, as the policy sampled them.
+        actions: [T] or [T, K] int64, or [T, A] float32, as the policy sampled them.
         rewards: [T] float64, the true reward; NaN throughout if it is unknown.
         terminated: the environment ended the episode; its value afterwards is zero.
         truncated: a time limit ended it; its value afterwards is not zero.
@@ -78,7 +78,7 @@ class Transitions:
 
     Attributes:
         observations: [B, D] float32.
-        actions: [B] int64 or [B, A] float32.
+        actions: [B] or [B, K] int64, or [B, A] float32.
         next_observations: [B, D] float32.
         terminated: [B] bool; false where a time limit ended the episode.
         remaining: [B] int64, steps that were left of the horizon after a terminated step (the
@@ -137,8 +137,8 @@ class Rollout:
 
     Attributes:
         observations: [T, N, D] float32.
-        actions: [T, N] int64 or [T, N, A] float32: the policy's samples. The environment clips
-            those outside the action space.
+        actions: [T, N] or [T, N, K] int64, or [T, N, A] float32: the policy's samples. The
+            environment clips those outside the action space.
         next_observations: [T, N, D] float32; where an episode ended, its final observation and
             not the first one of the next episode.
         log_probs: [T, N] float32, log pi(a|s) of the sampling policy; NaN from SAC, which trains on

@@ -73,7 +73,7 @@ class VectorWorlds:
         )
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Ended]]:
-        """Advance every environment by one action of ``actions`` [N] or [N, A].
+        """Advance every environment by one action of ``actions`` [N], [N, K] or [N, A].
 
         Returns observations [N, D] float32, true rewards [N] float64, and the episodes that
         ended. Where an episode ended, the observation is the first one of the next episode.

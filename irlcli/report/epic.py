@@ -13,7 +13,7 @@ import numpy as np
 _TRANSITIONS = 2000
 _PAIRS = 200
 
-# Rewards [B] of observations [B, D], actions [B] or [B, A] and next observations [B, D].
+# Rewards [B] of observations [B, D], actions [B], [B, K] or [B, A] and next observations [B, D].
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 

@@ -85,7 +85,7 @@ class Expected:
             )
 
     def shaped(self, actions: np.ndarray) -> np.ndarray:
-        """``actions`` [B] or [B, A] in the form that the environment's actions have."""
+        """``actions`` [B], [B, K] or [B, A] in the form that the environment's actions have."""
         fitting = (len(actions), *self.actions.shape)
         if actions.size == math.prod(fitting):
             actions = actions.reshape(fitting)
@@ -100,7 +100,7 @@ def vectors(array: np.ndarray) -> np.ndarray:
 
 
 def action_array(array: np.ndarray) -> np.ndarray:
-    """Recorded actions as int64 [B] or [B, A], or as float32 [B] or [B, A]."""
+    """Recorded actions [B] or [B, K] as int64 or float32."""
     if array.ndim > 2:
         array = array.reshape(len(array), -1)
     if array.dtype.kind in "iub":
