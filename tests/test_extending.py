@@ -138,7 +138,7 @@ def test_a_stage(lab, store_copy):
 
     runner = Runner(store_copy.path)
     demos = runner.store.resolve("demos").artefact
-    from irlcli.experiments.runner import source_of
+    from irlcli.experiments.status import source_of
     from irlcli.store import Resolved
 
     source = source_of(Resolved(demos, demos.directory))

@@ -14,7 +14,7 @@ from irlcli.requests.session import DEFAULT_STORE
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
-    from irlcli.experiments.runner import Step
+    from irlcli.experiments.status import Step
     from irlcli.stages.base import Request
 
 
@@ -187,7 +187,7 @@ class StageSession(base.StageSession):
         self._prepared.append(request)
         if not self.dry_run:
             return super().prepare(request, then)
-        from irlcli.experiments.runner import Step
+        from irlcli.experiments.status import Step
 
         steps = self.runner().plan(request)
         if steps[-1].artefact is None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.introduce import introduce
-from irlcli.experiments.runner import source_of
+from irlcli.experiments.status import source_of
 from irlcli.stages.base import Source
 from irlcli.store import Artefact, Index, Resolved, Store, read_json
 

@@ -19,8 +19,6 @@ from irlcli.store import Artefact, KeyRecord, Resolved, Store
 if TYPE_CHECKING:
     from irlcli.store.sources import Place
 
-__all__ = ["Runner", "Silent", "Step", "source_of"]
-
 CHECKPOINT_SECONDS = 10.0
 
 

@@ -5,7 +5,7 @@ import msgspec
 from irlcli.configs.load import unseen_settings
 from irlcli.errors import UsageError
 from irlcli.experiments.references import demonstrations
-from irlcli.experiments.runner import source_of
+from irlcli.experiments.status import source_of
 from irlcli.interventions import check_tabular, parse_setting
 from irlcli.methods import METHODS
 from irlcli.penalties import maxent_methods
