@@ -270,6 +270,8 @@ UNREAD = {
 # Challengers need logits without log pi. A mean of rounds has no best round, nor has a training that
 # may end early.
 REFUSED = ["airl.ppo.use_sde", "airl.logit", "airl.averaged_rounds", "airl.plateau_rounds"]
+# Beside gSDE.
+REFUSED += [f"{part}.ppo.log_std_max" for part in ("expert", "transfer", "airl.challenger")]
 # Fields whose type does not tell another valid value.
 CHANGED = {
     "expert.bar": 1.0,
@@ -277,6 +279,7 @@ CHANGED = {
     "airl.penalty": "other",
     "airl.select": "episodes",
     "airl.dropout": 0.5,
+    **{f"{part}.ppo.adam_eps": 1e-5 for part in ("expert", "transfer", "airl", "airl.challenger")},
     "airl.columns": (-1,),
     "airl.averaged_rounds": 3,
     "airl.averaged_by": "learning-rate",

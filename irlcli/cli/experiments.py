@@ -257,9 +257,9 @@ def _check_options(
             "name them: --tag NAME",
         )
     if choice.only is not None and (choice.until or directory or options.jobs):
-        raise UsageError("--only takes no --until, --out or --jobs", "it makes one step")
+        raise UsageError("--only takes no --until, --out or --jobs", "omit them: it makes one step")
     if about_jobs and (directory or options.jobs):
-        raise UsageError(f"--{about_jobs} takes no --out and no --jobs", "it makes no step")
+        raise UsageError(f"--{about_jobs} makes no step", "omit --out and --jobs")
     if choice.until is not None and directory is not None:
         raise UsageError("--until makes no report, so --out has no files", "omit one of them")
     if choice.only is not None and options.cluster is not None:

@@ -58,13 +58,15 @@ class Session(base.Session):
         """Refuse a file to write, which ``option`` named, before any work is done.
 
         Raises:
-            UsageError: its directory does not exist, or lies in the store.
+            UsageError: it is a directory, or its directory does not exist or lies in the store.
         """
         if not path.parent.is_dir():
             raise UsageError(
                 f"{path} cannot be written: {path.parent} is not a directory",
                 "create the directory first",
             )
+        if path.is_dir():
+            raise UsageError(f"{path} is a directory", f"name a file with {option}")
         if path.resolve().is_relative_to(self.store.root.resolve()):
             raise UsageError(f"{path} lies in the store", f"name another file with {option}")
 

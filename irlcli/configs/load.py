@@ -98,9 +98,8 @@ def _check_set_once(overrides: Sequence[Layer], flags: Mapping[str, Any]) -> Non
         dotted, value = _field_of(item, values)
         if flags.get(dotted) not in (None, value):
             raise UsageError(
-                f"--set {item!r}: another option sets {dotted} to {flags[dotted]!r}",
-                f"omit --set {dotted}, or --{dotted.rpartition('.')[2].replace('_', '-')} "
-                "or --method, whichever sets it",
+                f"--set {item!r}: the method or another option sets {dotted} to {flags[dotted]!r}",
+                f"omit --set {dotted}, or choose another method or value",
             )
 
 

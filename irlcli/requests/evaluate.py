@@ -147,7 +147,7 @@ def _of_agent(
         missing = "--env ENV " if env is None else ""
         raise UsageError(
             f"--{agent} needs the settings to evaluate in",
-            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood",
+            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood KNOB=VALUE",
         )
     config = session.config(env, {"evaluation.episodes": episodes})
     origin = None if scored_by is None else scored_by.origin

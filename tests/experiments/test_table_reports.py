@@ -296,7 +296,8 @@ def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path
 def test_other_evaluations_are_left_out_too(report, irl, table_store, tmp_path):
     copy = tmp_path / "runs"
     shutil.copytree(table_store, copy, symlinks=True)
-    more = ["--store", copy, "--profile", "smoke", "--quiet", *SMALL, "--episodes", "3"]
+    three = [word.replace("episodes=2", "episodes=3") for word in SMALL]
+    more = ["--store", copy, "--profile", "smoke", "--quiet", *three]
     assert irl("evaluate", "--policy", "irm.0", "--ood", "1.5x", *more).code == 0
     (left_out,) = (n for n in caveats(report("table1", copy, *ROW)) if n.startswith("Left out"))
     assert left_out.endswith("evaluation.episodes 3 instead of 2.")
