@@ -112,8 +112,10 @@ def test_the_learned_return_is_drawn_if_there_is_a_reward(
 
 def test_what_cannot_be_drawn_is_named(irl, smoke_store, tmp_path):
     common = ["--store", smoke_store.path]
+    (tmp_path / "directory.gif").mkdir()
     for words, code, named in (
         (["airl", "--out", tmp_path / "a.avi"], 2, "a.avi"),
+        (["airl", "--out", tmp_path / "directory.gif"], 2, "is a directory"),
         (["airl", "--out", tmp_path / "no" / "a.mp4"], 2, "not a directory"),
         (["airl", "--out", smoke_store.path / "a.gif"], 2, "lies in the store"),
         (["airl", "--out", tmp_path / "a.mp4", "--reward", "nothing"], 3, "nothing"),
