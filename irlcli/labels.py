@@ -65,8 +65,7 @@ def budget(parameters: Mapping[str, Any]) -> str:
     """How long a stage trains or how much it measures, in which profiles differ; else empty."""
     for config in (parameters.get("airl"), parameters.get("transfer"), parameters):
         if isinstance(config, dict) and isinstance(config.get("total_steps"), int):
-            restarts = config.get("restarts")
-            return f"{steps(config) * (restarts if isinstance(restarts, int) else 1):,} steps"
+            return f"{steps_of_all_restarts(config):,} steps"
     for section, field, unit in _BUDGETS:
         config = parameters.get(section) if section else parameters
         found = config.get(field) if isinstance(config, dict) else None
@@ -89,6 +88,13 @@ def steps(config: Mapping[str, Any], budget: int | None = None) -> int:
         return total
     size = math.prod(sizes)
     return -(-total // size) * size
+
+
+def steps_of_all_restarts(config: Mapping[str, Any]) -> int:
+    """Environment steps of a training with ``config`` and of its restarts, if it has any."""
+    restarts, each = config.get("restarts"), config.get("restart_steps")
+    others = restarts - 1 if isinstance(restarts, int) else 0
+    return steps(config) + others * steps(config, each if isinstance(each, int) else None)
 
 
 def learned(config: Mapping[str, Any]) -> str:

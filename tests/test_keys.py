@@ -289,6 +289,7 @@ CHANGED = {
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
     "transfer.restarts": 3,
+    "transfer.restart_steps": 5,
     "transfer.restart_episodes": 7,
     "transfer.sac.tau": 0.1,
     "transfer.sac.ent_coef": 0.1,
@@ -568,6 +569,10 @@ def test_one_restart_is_in_no_key():
     assert key(retrained(measured)) != key(retrained(two))
     default = with_field(two, "transfer.restart_episodes", 100)
     assert key(retrained(default)) == key(retrained(two))
+    compared = with_field(two, "transfer.restart_steps", 10)
+    assert key(retrained(compared)) != key(retrained(two))
+    alone = with_field(compared, "transfer.restarts", 1)
+    assert key(retrained(alone)) == key(retrained(one))
 
 
 def test_no_warm_up_is_in_no_key():

@@ -232,9 +232,16 @@ def relevant_transfer(
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
     if from_student or transfer.restarts in (UNSET, 1):
-        transfer = replace(transfer, restarts=UNSET, restart_episodes=UNSET)
-    elif transfer.restart_episodes is UNSET:
-        transfer = replace(transfer, restart_episodes=_RESTART_EPISODES)
+        transfer = replace(transfer, restarts=UNSET, restart_steps=UNSET, restart_episodes=UNSET)
+    else:
+        if transfer.restart_episodes is UNSET:
+            transfer = replace(transfer, restart_episodes=_RESTART_EPISODES)
+        if transfer.restart_steps is not UNSET and transfer.restart_steps >= transfer.total_steps:
+            raise UsageError(
+                f"transfer.restart_steps = {transfer.restart_steps} is not below "
+                f"transfer.total_steps = {transfer.total_steps}",
+                "omit transfer.restart_steps: each restart then has the whole budget",
+            )
     if transfer.algorithm == "sac":
         if discrete_actions:
             raise UsageError("SAC needs continuous actions", "use --algorithm ppo")

@@ -146,9 +146,10 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         ceiling: every step's reward is at most this quantile of g on the demonstrations; None: g
             has no bound.
         from_student: replaces the budget and the learning rate with ``--start student``.
-        restarts: policies trained one after the other, each from other random weights and with the
-            whole budget. The one with the highest learned return is kept. ``--start student``
-            ignores it.
+        restarts: policies trained one after the other, each from other random weights. The one with
+            the highest learned return is kept. ``--start student`` ignores it.
+        restart_steps: environment steps of each restart. Only the one that is kept is then trained
+            to the whole budget. Unset: each restart has the whole budget.
         restart_episodes: over which the learned return of a restart is measured; 100 by default.
     """
 
@@ -159,6 +160,7 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     sac: SACConfig = SACConfig()
     from_student: FromStudentConfig = FromStudentConfig()
     restarts: Count | UnsetType = UNSET
+    restart_steps: Count | UnsetType = UNSET
     restart_episodes: Count | UnsetType = UNSET
 
     @property

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.stats import ttest_ind_from_stats
 
 from irlcli.data.descriptions import Verdict
-from irlcli.labels import steps
+from irlcli.labels import steps, steps_of_all_restarts
 from irlcli.report import paper
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
 from irlcli.report.compute import failed_to_imitate
@@ -359,7 +359,7 @@ def budgets(p: Parameters) -> Table:
                     ]
                 ),
                 config["airl"]["select"],
-                f"{steps(transfer) * transfer.get('restarts', 1):,}"
+                f"{steps_of_all_restarts(transfer):,}"
                 if {"transfer", "transfer-id"} & set(p.measures)
                 else "-",
                 f"{steps(transfer, transfer['from_student']['total_steps']):,}"

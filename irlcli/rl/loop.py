@@ -180,22 +180,30 @@ class Training:
     @property
     def planned_steps(self) -> int:
         """Environment steps of all rounds."""
-        return self.trainer.rounds * self.trainer.steps_per_round
+        return self.steps_until(None)
+
+    def steps_until(self, until: int | None) -> int:
+        """Environment steps of the rounds that :meth:`run` needs to reach ``until``."""
+        size = self.trainer.steps_per_round
+        rounds = self.trainer.rounds if until is None else -(-until // size)
+        return min(rounds, self.trainer.rounds) * size
 
     def run(
         self,
         after_round: Callable[[Training, list[Row]], None],
         warn: Callable[[str], None],
+        until: int | None = None,
     ) -> list[Row]:
         """Train to the last round, or to where ``ends`` says so, and return all rows.
 
-        ``after_round`` gets each round's rows.
+        ``after_round`` gets each round's rows. After the round that reaches ``until`` environment
+        steps training stops; another call continues it.
         """
         if self.rounds_done == 0:
             self.learner.begin(self.trainer)
         for index in range(self.rounds_done, self.trainer.rounds):
             # Here, not at the end: a resumed run may have been killed after its last round.
-            if self._ends(self.rows):
+            if self._ends(self.rows) or (until is not None and self.steps >= until):
                 break
             rollouts = self.trainer.train_round(index, self.source)
             challenge = [] if self.challengers is None else self.challengers.train_round(index)

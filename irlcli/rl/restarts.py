@@ -19,33 +19,35 @@ class Restarts:
         begin: the training of a restart, by its index, from random weights.
         count: of restarts.
         score: of a trained policy; higher is better.
+        until: environment steps after which the restarts are compared. Only the best is trained to
+            its end. None: each is trained to its end before.
 
     Attributes:
-        scores: of the restarts that are done.
+        scores: of the restarts that reached the comparison.
     """
 
     def __init__(
-        self, begin: Callable[[int], Training], count: int, score: Callable[[Policy], float]
+        self,
+        begin: Callable[[int], Training],
+        count: int,
+        score: Callable[[Policy], float],
+        until: int | None = None,
     ):
         self._begin = begin
         self._count = count
         self._score = score
-        self._past: list[Row] = []
+        self._until = until
+        self._others: list[Row] = []
         self._best: dict[str, Any] = {}
         self.scores: list[float] = []
         self._index = 0
         self._training = begin(0)
 
-    def _start(self, index: int) -> None:
-        self._index = index
-        # Before the next one takes its memory.
-        del self._training
-        self._training = self._begin(index)
-
     @property
     def rows(self) -> list[Row]:
         """The rows of all restarts so far, each with the index of its ``restart``."""
-        return self._past + self._numbered(self._training.rows)
+        rows = self._others + self._numbered(self._training.rows)
+        return sorted(rows, key=lambda row: row["restart"])
 
     @property
     def policy(self) -> Policy:
@@ -55,36 +57,53 @@ class Restarts:
     @property
     def steps(self) -> int:
         """Environment steps taken so far."""
-        return self._index * self._training.planned_steps + self._training.steps
+        others = min(len(self.scores), self._count - 1)
+        return others * self._training.steps_until(self._until) + self._training.steps
 
     @property
     def planned_steps(self) -> int:
         """Environment steps of all restarts."""
-        return self._count * self._training.planned_steps
+        others = self._count - 1
+        return others * self._training.steps_until(self._until) + self._training.planned_steps
 
     def run(
         self,
         after_round: Callable[[Restarts, list[Row]], None],
         warn: Callable[[str], None],
     ) -> list[Row]:
-        """Train to the end of the last restart and put the weights of the best one in place.
+        """Train and compare all restarts, then train the best one to its end.
 
         Returns:
             All rows; ``kept`` says whether they are of the best restart.
         """
-        for index in range(self._index, self._count):
-            if index > self._index:
-                self._past = self.rows
-                self._start(index)
-            self._training.run(lambda _, rows: after_round(self, self._numbered(rows)), warn)
+
+        def report(_: Training, rows: list[Row]) -> None:
+            after_round(self, self._numbered(rows))
+
+        while len(self.scores) < self._count:
+            self._training.run(report, warn, self._until)
             score = self._score(self.policy)
-            # The first of equals.
+            rows = self.rows
             if not self.scores or score > max(self.scores):
-                self._best = copy.deepcopy(self.policy.state_dict())
+                self._best = copy.deepcopy(self._training.state_dict())
             self.scores.append(score)
-        self.policy.load_state_dict(self._best)
-        best = self.scores.index(max(self.scores))
-        return [row | {"kept": row["restart"] == best} for row in self.rows]
+            if len(self.scores) < self._count:
+                self._start(len(self.scores), rows)
+            else:
+                self._start(self.scores.index(max(self.scores)), rows, self._best)
+        self._training.run(report, warn)
+        return [row | {"kept": row["restart"] == self._index} for row in self.rows]
+
+    def _start(self, index: int, rows: Sequence[Row] = (), state: State | None = None) -> None:
+        """Begin restart ``index``, or continue it from ``state`` and its own of ``rows``."""
+        self._index = index
+        # Before the next one takes its memory.
+        del self._training
+        self._training = self._begin(index)
+        self._others = [row for row in rows if row["restart"] != index]
+        if state is not None:
+            own = [row for row in rows if row["restart"] == index]
+            self._training.load_state_dict(state, [_without_restart(row) for row in own])
 
     def _numbered(self, rows: Sequence[Row]) -> list[Row]:
         return [{"restart": self._index} | row for row in rows]
@@ -101,8 +120,10 @@ class Restarts:
         """Continue from ``state_dict()`` and the ``rows`` of that moment."""
         self.scores = state["scores"].tolist()
         self._best = state["best"]
-        self._start(len(self.scores))
-        self._past = [row for row in rows if row["restart"] < self._index]
-        own = [row for row in rows if row["restart"] == self._index]
-        without = [{name: v for name, v in row.items() if name != "restart"} for row in own]
-        self._training.load_state_dict(state["training"], without)
+        compared = len(self.scores) == self._count
+        index = self.scores.index(max(self.scores)) if compared else len(self.scores)
+        self._start(index, rows, state["training"])
+
+
+def _without_restart(row: Row) -> Row:
+    return {name: value for name, value in row.items() if name != "restart"}

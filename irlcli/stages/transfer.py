@@ -124,7 +124,13 @@ def run(job: Job) -> None:
         if p.transfer.restarts is UNSET:
             training = begin(0)
         else:
-            training = Restarts(begin, p.transfer.restarts, partial(_learned_return, job, reward))
+            until = p.transfer.restart_steps
+            training = Restarts(
+                begin,
+                p.transfer.restarts,
+                partial(_learned_return, job, reward),
+                None if until is UNSET else until,
+            )
         rows = run_training(job, training)
     write_policy(
         job.output,

@@ -249,22 +249,50 @@ def test_one_restart_is_the_policy_without(runs, irl):
     assert paid[0] != paid[1] and same == (paid[0] > paid[1])
 
 
+def test_the_best_restart_alone_has_the_whole_budget(runs, irl):
+    """Three restarts of one round; the best has a second, as if it had been alone from the start."""
+    line = [*RESTARTS[:-2], "--set", "transfer.total_steps=4096"]
+    each = ["--set", "transfer.restart_steps=2048"]
+    artefact = made(runs, irl(*line, *RESTARTS[-2:], *each, *common(runs)))
+    rows = pq.read_table(artefact.directory / "metrics.parquet").to_pylist()
+    kept = [row["round"] for row in rows if row["kept"]]
+    assert kept == [0, 1] and len(rows) == 4
+    assert "8,192 steps" in irl("ls", "--store", runs).out
+    whole = made(runs, irl(*line, *RESTARTS[-2:], *common(runs)))
+    best = next(row["restart"] for row in rows if row["kept"])
+    both = [
+        [row["true_return"] for row in found if row["restart"] == best]
+        for found in (rows, pq.read_table(whole.directory / "metrics.parquet").to_pylist())
+    ]
+    assert both[0] == both[1] and len(both[0]) == 2
+
+
+def test_restarts_as_long_as_the_whole_budget_are_refused(runs, irl):
+    done = irl(*RESTARTS, "--set", "transfer.restart_steps=2048", *common(runs))
+    assert done.code == 2 and "transfer.restart_steps" in done.err and "omit" in done.err
+
+
 def test_sac_restarts(runs, irl):
     artefact = made(runs, irl(*SAC, *RESTARTS[-2:-1], "transfer.restarts=2", *common(runs)))
     about = json.loads((artefact.directory / "policy.json").read_text())
     assert about["network"]["squashed"] and len(about["restarts"]) == 2
 
 
-def test_restarts_interrupted_and_run_again_give_the_same_bytes(runs, irl, tmp_path, monkeypatch):
-    """Interrupted in its second restart, of two rounds, it resumes there."""
+@pytest.mark.parametrize(
+    ("each", "done"), [([], [0, 1, 0, 1]), (["--set", "transfer.restart_steps=1024"], [0, 0, 1])]
+)
+def test_restarts_interrupted_and_run_again_give_the_same_bytes(
+    runs, irl, tmp_path, monkeypatch, each, done
+):
+    """Interrupted in its third round, it resumes there."""
     line = [*RESTARTS[:-1], "transfer.restarts=2", "--set", "transfer.total_steps=2048"]
-    line += ["--set", "transfer.ppo.rollouts_per_round=1"]
+    line += ["--set", "transfer.ppo.rollouts_per_round=1", *each]
     whole = shutil.copytree(runs, tmp_path / "whole", symlinks=True)
     expected = made(whole, irl(*line, *common(whole)))
     rounds = interrupt(PPOTrainer, 3, monkeypatch)
     assert irl(*line, *common(runs)).code == 130
     resumed = made(runs, irl(*line, *common(runs)))
-    assert rounds == [0, 1, 0, 1]
+    assert rounds == done
     assert resumed.provenance()["resumed"] == 1
     assert resumed.id == expected.id
 
