@@ -61,7 +61,7 @@ class Runs:
     def run(self, store: Path, *more: object, code: int = 0, **environment: str) -> str:
         """What a run printed on stderr."""
         process = self.start(store, *more, **environment)
-        _, errors = process.communicate(timeout=200)
+        _, errors = process.communicate(timeout=600)
         assert process.returncode == code, errors
         return errors
 
@@ -135,7 +135,7 @@ def test_what_exists_needs_no_process(uninterrupted, runs):
     errors = runs.run(store, *REWARDS)
     assert "6 of 6 steps exist" in errors
     process = runs.start(store, *REWARDS, "--json")
-    document = json.loads(process.communicate(timeout=300)[0])
+    document = json.loads(process.communicate(timeout=600)[0])
     assert (document["kind"], document["existed"], document["made"]) == ("run", 6, 0)
     assert runs.processes() == [] and earlier.log.read_bytes() == before
 
@@ -179,7 +179,7 @@ def test_two_runs_at_once_make_each_artefact_once(uninterrupted, runs, tmp_path)
     store = tmp_path / "runs"
     both = [runs.start(store, *REWARDS, "--jobs", "2", IRL_TEST_ROUND="0.1") for _ in range(2)]
     for process in both:
-        _, errors = process.communicate(timeout=200)
+        _, errors = process.communicate(timeout=600)
         assert process.returncode == 0, errors
     assert Store(store).ids() == ids
     assert set(runs.computed().values()) == {1} and len(runs.computed()) == len(ids)
@@ -248,7 +248,7 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
         for _ in range(count):
             process.send_signal(signal.SIGINT)
             time.sleep(0.3)
-        out, errors = process.communicate(timeout=200)
+        out, errors = process.communicate(timeout=600)
         assert (process.returncode, out) == (130, "")
         assert "error: stopped: " in errors and "same command again" in errors
         computing = {line["pid"] for line in runs.lines()[begin:] if "computes" in line}
