@@ -311,6 +311,12 @@ def parse_setting(env: str, text: str) -> Setting:
     if text == "default":
         environment(env)
         return Setting()
+    if "=" not in text:
+        raise UsageError(
+            f"{text!r} is not a setting",
+            "write KNOB=VALUE, KNOB=VALUE,KNOB=VALUE or default; "
+            f"{env} has: {', '.join(sorted(environment(env).knobs))}",
+        )
     parts = text.split(",")
     if len(parts) == 1 or not all("=" in part for part in parts):
         settings = parse_settings(env, text)
