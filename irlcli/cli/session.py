@@ -170,10 +170,15 @@ class StageSession(base.StageSession):
         return artefacts
 
     def _warn_of_unread(self, requests: Sequence["Request"]) -> None:
-        """Warn of a ``--set`` of a section that none of the stages behind ``requests`` reads."""
+        """Warn of each ``--set`` that ``requests`` and what they need do not use."""
         if not self.overrides:
             return
-        stages = {stage for request in requests for stage in _stages(request)}
+        from irlcli.requests.overrides import behind, replaced
+
+        every = [made for request in requests for made in behind(request)]
+        for line in replaced(self.overrides, every):
+            self.console.warn(line)
+        stages = {request.stage.name for request in every}
         if not stages <= _SECTIONS.keys():
             return
         read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
@@ -235,13 +240,3 @@ def _check_repeated(overrides: Sequence[str]) -> None:
     for field in fields:
         if fields.count(field) > 1:
             raise UsageError(f"--set {field} is given twice", f"give {field} once")
-
-
-def _stages(request: "Request") -> Iterator[str]:
-    """The names of the stages that make ``request`` and what it needs."""
-    from irlcli.stages.base import From
-
-    yield request.stage.name
-    for source in request.inputs.values():
-        if isinstance(source, From):
-            yield from _stages(source.request)

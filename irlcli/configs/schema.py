@@ -36,6 +36,18 @@ Grouping = Literal["pooled", "balanced", "per-setting", "shuffled"]
 
 # Torch's. See PPOConfig.adam_eps.
 ADAM_EPS = 1e-8
+# What a field means that is unset, where a value means the same. In keys it is left out.
+UNSET_MEANS: dict[str, Any] = {
+    "adam_eps": ADAM_EPS,
+    "restarts": 1,
+    "mixed_share": 0.0,
+    "per_setting": False,
+    "dropout": 0.0,
+    "columns": (),
+    "averaged_rounds": 1,
+    "averaged_by": "rounds",
+    "penalty_warmup_iterations": 0,
+}
 
 
 class PPOConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from irlcli.configs.load import in_profile, read_toml
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
+from irlcli.requests.overrides import replaced
 from irlcli.requests.session import StageSession, check_path
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     _check_weights(session, table)
     if choice.only is None:
         # The processes that make one step each would repeat it.
-        _warn_of_unread(session, table)
+        _warn_of_unread(session, plan)
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
@@ -146,10 +147,12 @@ def _check_weights(session: StageSession, table: "Table") -> None:
         )
 
 
-def _warn_of_unread(session: StageSession, table: "Table") -> None:
+def _warn_of_unread(session: StageSession, plan: "Plan") -> None:
+    for line in replaced(session.overrides, [task.request for task in plan.tasks.values()]):
+        session.console.warn(line)
     for item in session.overrides:
-        if item.partition(".")[0].strip() not in _SECTIONS[table.kind]:
-            session.console.warn(f"no step of {table.name} reads --set {item}")
+        if item.partition(".")[0].strip() not in _SECTIONS[plan.table.kind]:
+            session.console.warn(f"no step of {plan.table.name} reads --set {item}")
 
 
 def _weights_in(tree: Mapping[str, Any], knobs: Set[str]) -> Iterator[str]:

@@ -252,6 +252,50 @@ def test_a_field_that_no_step_of_a_table_reads_is_named(irl, tmp_path, table, it
     assert (f"warning: no step of {table} reads --set {item}" in done.err) == unread
 
 
+ERM = "train-airl --demos demos --method erm"
+# Challengers in each setting, averaged by the rates of a schedule that falls.
+PARTS = ("airl.challenger.per_setting=true", "airl.averaged_by=learning-rate")
+
+
+@pytest.mark.parametrize(
+    ("line", "items", "unused"),
+    [
+        (ERM, [PARTS[0], "airl.challenger.life=0"], {PARTS[0]: "false"}),
+        (ERM, [PARTS[0], "airl.challenger.life=1", "airl.logit=f", "airl.policy_reward=f"], {}),
+        (ERM, [PARTS[1], "airl.averaged_rounds=1"], {PARTS[1]: "rounds"}),
+        (ERM, ["airl.pairing=pooled"], {"airl.pairing=pooled": "matched"}),
+        (f"{ERM}-balanced", ["airl.pairing=pooled"], {}),
+        (ERM, ["airl.dropout=0", "airl.averaged_rounds=1", "airl.columns=[]"], {}),
+        (ERM, ["airl.ppo.batch_size=99999"], {"airl.ppo.batch_size=99999": "1024"}),
+        (
+            "transfer --reward airl --ood 1.5x --start student",
+            ["transfer.total_steps=5", "transfer.from_student.total_steps=7"],
+            {"transfer.total_steps=5": "7"},
+        ),
+        ("transfer --reward airl --ood 1.5x", ["transfer.ceiling=none"], {}),
+        (
+            "plan table1 --rows lunar-lander --tag x",
+            ["airl.select_every=3"],
+            {"airl.select_every=3": "10"},
+        ),
+        (
+            "plan table1 --rows lunar-lander --tag x",
+            ["transfer.restarts=2", "transfer.restart_steps=9"],
+            {},
+        ),
+    ],
+)
+def test_a_value_that_the_others_leave_without_effect_is_named(
+    irl, smoke_store, line, items, unused
+):
+    sets = [word for item in items for word in ("--set", item)]
+    dry = [] if line.startswith("plan") else ["--dry-run"]
+    done = irl(*line.split(), *sets, *SMOKE, "--store", smoke_store.path, *dry)
+    assert done.code == 0, done.err
+    warned = dict(re.findall(r"--set (\S+) is not used: .* it is (\S+)", done.err))
+    assert warned == unused
+
+
 def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):
     line = ["train-airl", "--demos", "demos", "--method", "irm", "--choose-penalty", "0.1,1"]
     item = "evaluation.episodes=2"

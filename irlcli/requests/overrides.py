@@ -1,0 +1,57 @@
+"""What ``--set`` asks for, beside what requests hold."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from irlcli.configs.load import overridden
+from irlcli.configs.schema import UNSET_MEANS
+from irlcli.stages.base import From, Request
+
+# Requests hold these values under the fields that they replace.
+_ELSEWHERE = "transfer.from_student."
+
+
+def behind(request: Request) -> Iterator[Request]:
+    """``request`` and all that make its inputs."""
+    yield request
+    for source in request.inputs.values():
+        if isinstance(source, From):
+            yield from behind(source.request)
+
+
+def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[str]:
+    """A line for each override whose field ``requests`` hold, but none of them its value.
+
+    Fields that cannot change a result have one value in every key
+    (:mod:`irlcli.configs.relevance`).
+    """
+    if not overrides:
+        return
+    parameters = [request.parameters for request in requests]
+    for item, (field, value) in zip(overrides, overridden(overrides).items(), strict=True):
+        held = {_held(field, each) for each in parameters} - {None}
+        if field.startswith(_ELSEWHERE):
+            continue
+        if held and _shown(field, value) not in held:
+            values = " or ".join(sorted(text for text in held if text))
+            yield f"--set {item} is not used: with the other values it is {values}"
+
+
+def _held(field: str, parameters: Any) -> str | None:
+    """The value of ``field`` in a request's parameters; None if they have no such field."""
+    value = parameters
+    for name in field.split("."):
+        if not hasattr(value, name):
+            return None
+        value = getattr(value, name)
+    return _shown(field, value)
+
+
+def _shown(field: str, value: Any) -> str:
+    if value is msgspec.UNSET:
+        value = UNSET_MEANS.get(field.rpartition(".")[2], "unset")
+    if value is None:
+        return "none"
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
