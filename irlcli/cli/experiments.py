@@ -14,7 +14,7 @@ from irlcli.cli import console as out
 from irlcli.cli.cluster import ClusterOptions
 from irlcli.cli.options import planning_command, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.cli.tables import check_out, copy_outputs, print_report, report_of
+from irlcli.cli.table_report import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
 from irlcli.requests.tables import Choice, open_plan, steps_of
 

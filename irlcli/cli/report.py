@@ -17,7 +17,7 @@ from irlcli.cli.experiments import (
 )
 from irlcli.cli.options import Name, sources_of_environment, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.cli.tables import (
+from irlcli.cli.table_report import (
     check_out,
     copy_outputs,
     print_report,
