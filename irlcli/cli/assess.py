@@ -86,15 +86,11 @@ def print_assessment(assessment: Assessment) -> None:
     out.print_table(columns, [_ranked(s) for s in every], stderr=True)
     if assessment.epic_missing:
         out.print_note(f"no EPIC distance: {assessment.epic_missing}")
-    weak = set[str]()
-    for s in assessment.settings:
-        mean = {e.kind: e.true.mean for e in assessment.bank if e.setting == s.setting}
-        if s.retrained and mean["expert"] <= mean["random"]:
-            weak.add(s.setting)
-            out.print_note(
-                f"{s.setting}: the expert earns no more than the random agent, so there is no "
-                "verdict"
-            )
+    weak = assessment.weak_settings
+    for setting in weak:
+        out.print_note(
+            f"{setting}: the expert earns no more than the random agent, so there is no verdict"
+        )
     splits: list[list[Any]] = [
         [
             s.setting,

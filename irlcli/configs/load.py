@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 from irlcli.configs.relevance import check_registered
 from irlcli.configs.schema import (
@@ -258,10 +258,16 @@ def _parse_toml(text: str) -> dict[str, Any]:
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with the values of ``over``; a field that is unset in ``over`` is in neither."""
     merged = dict(base)
     for name, value in over.items():
-        both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
-        merged[name] = _merge(merged[name], value) if both else value
+        if isinstance(value, Mapping):
+            inner = merged.get(name)
+            merged[name] = _merge(inner if isinstance(inner, Mapping) else {}, value)
+        elif value is UNSET:
+            merged.pop(name, None)
+        else:
+            merged[name] = value
     return merged
 
 
@@ -328,15 +334,21 @@ def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
 
 
 def _with_none(tree: Mapping[str, Any], kind: Any) -> dict[str, Any]:
-    """``tree`` with None for "none" where a field of ``kind`` may be None: TOML has no null."""
+    """``tree`` with None or unset for "none" where a field of ``kind`` may be: TOML has no null."""
     found = dict(tree)
     for name, value in tree.items():
         field = InterventionConfig if kind == _INTERVENTIONS else kind.__annotations__.get(name)
-        if value == "none" and type(None) in get_args(field) and _table(field) is None:
-            found[name] = None
+        if value == "none" and _table(field) is None and (nothing := _nothing(field)):
+            (found[name],) = nothing
         elif isinstance(value, Mapping) and (inner := _table(field)):
             found[name] = _with_none(value, inner)
     return found
+
+
+def _nothing(field: Any) -> tuple[Any, ...]:
+    """What "none" means in a field of this annotation: None, or unset; empty if it is a value."""
+    kinds = get_args(field)
+    return (None,) if type(None) in kinds else (UNSET,) if UnsetType in kinds else ()
 
 
 def _table(field: Any) -> Any:
@@ -397,8 +409,8 @@ def _homes(name: str) -> list[str]:
 
 
 def _typed(text: str, kind: Any, field: str) -> Any:
-    if text == "none" and type(None) in get_args(kind):
-        return None
+    if text == "none" and (nothing := _nothing(kind)):
+        return nothing[0]
     try:
         value = _parse_toml(f"value = {text}")["value"]
     except (ValueError, RecursionError):
@@ -422,8 +434,8 @@ def _field_hint(field: str) -> str:
             return "see settings/ for examples"
         (kind,) = (f.type for f in msgspec.structs.fields(value) if f.name == name)
         value = getattr(value, name)
-    unset = value is msgspec.UNSET
-    otherwise = ", or none" if type(None) in get_args(kind) else ", or omit it" if unset else ""
+    unset = value is UNSET
+    otherwise = ", or none" if _nothing(kind) else ""
     for member in get_args(kind) if otherwise else (kind,):
         if get_origin(member) is Literal:
             return f"one of: {', '.join(get_args(member))}"
@@ -437,9 +449,8 @@ def _field_hint(field: str) -> str:
     if unset:
         for member in get_args(kind):
             if int in get_args(member):
-                return f"write a whole number from {member.__metadata__[0].ge}, or omit it"
-        return "write a value, or omit it"
-    if value is None:
+                return f"write a whole number from {member.__metadata__[0].ge}, or none"
+    if unset or value is None:
         return "write a value, or none"
     return f"for example {_shown(value)}"
 

@@ -15,6 +15,7 @@ from irlcli.configs.schema import (
     Config,
     MaxEntConfig,
     PPOConfig,
+    SACConfig,
     TransferConfig,
 )
 from irlcli.errors import UsageError, suggest
@@ -66,8 +67,9 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
     """``ppo`` for an environment with discrete actions, or with continuous ones.
 
     Raises:
-        UsageError: an option for continuous actions where they are discrete, or a cap that gSDE does
-            not heed; the message names ``section``, for example ``expert.ppo``.
+        UsageError: an option for continuous actions where they are discrete, a cap that gSDE
+            ignores, or rollouts of a single sample; the message names ``section``, for example
+            ``expert.ppo``.
     """
     if discrete_actions:
         for name in ("use_sde", "log_std_init", "log_std_max"):
@@ -75,6 +77,11 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
                 raise UsageError(
                     f"{section}.{name} needs continuous actions", f"omit {section}.{name}"
                 )
+    if ppo.n_envs * ppo.n_steps < 2:
+        raise UsageError(
+            f"{section}: one world and one step make a rollout of a single sample",
+            f"--set {section}.n_steps=2 or more",
+        )
     if not ppo.use_sde:
         ppo = replace(ppo, sde_sample_freq=None)
     elif ppo.log_std_max is not None:
@@ -228,7 +235,7 @@ def relevant_transfer(
 
     Raises:
         UsageError: an unknown algorithm, or one or an option that does not fit the actions or the
-            start.
+            start, or SAC whose budget ends before its first update.
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
     if from_student or transfer.restarts in (UNSET, 1):
@@ -251,6 +258,7 @@ def relevant_transfer(
                 "use --algorithm ppo",
             )
         sac = transfer.sac
+        _check_updated(sac, transfer.total_steps)
         if not sac.net_arch:
             sac = replace(sac, activation=_TRANSFER.sac.activation)
         return replace(transfer, ppo=_PPO, sac=sac, from_student=_TRANSFER.from_student)
@@ -267,6 +275,17 @@ def relevant_transfer(
         )
     ppo = relevant_ppo(transfer.ppo, discrete_actions, "transfer.ppo")
     return replace(transfer, ppo=ppo, sac=_TRANSFER.sac, from_student=_TRANSFER.from_student)
+
+
+def _check_updated(sac: SACConfig, total_steps: int) -> None:
+    size = sac.n_envs * sac.n_steps
+    steps = -(-total_steps // size) * size
+    if sac.learning_starts >= steps:
+        raise UsageError(
+            f"transfer.sac.learning_starts = {sac.learning_starts} leaves no update: training has "
+            f"{steps} steps",
+            f"--set transfer.sac.learning_starts={steps - 1} or less, or more transfer.total_steps",
+        )
 
 
 def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:

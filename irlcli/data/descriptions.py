@@ -288,6 +288,16 @@ class Assessment(Struct, frozen=True, kw_only=True):
     bank: tuple[BankEntry, ...]
     epic_missing: str = ""
 
+    @property
+    def weak_settings(self) -> list[str]:
+        """Settings with verdicts that mean nothing: the expert earns no more than the random agent."""
+        found = []
+        for s in self.settings:
+            mean = {e.kind: e.true.mean for e in self.bank if e.setting == s.setting}
+            if s.retrained and mean["expert"] <= mean["random"]:
+                found.append(s.setting)
+        return found
+
 
 class HintContrast(Struct, frozen=True, kw_only=True):
     """How a reward depends on each hint of :mod:`irlcli.envs.cue` in one setting.

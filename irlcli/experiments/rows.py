@@ -32,7 +32,7 @@ from irlcli.experiments.variants import Configs
 from irlcli.interventions import Setting, listed_settings
 from irlcli.methods import fields, method
 from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
-from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell
+from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, has_held_out
 from irlcli.stages import (
     assess,
     choose_penalty,
@@ -354,8 +354,7 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Retrained]]) -
     """
     requests, run = reward.requests, reward.run
     row, trained, unseen = requests.row, requests.trained, requests.unseen
-    looked_at = not set(reward.measures) <= {*IN_DISTRIBUTION, ASSESS, CUE}
-    places = [*trained, *(unseen if looked_at else ())]
+    places = [*trained, *(unseen if has_held_out(reward.measures) else ())]
     imitation = clone.request(From(reward.demos), row.env, trained, requests.config)
     yield Task(f"{run.shared}.clone", "returns", imitation)
     experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}

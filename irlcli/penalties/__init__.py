@@ -89,7 +89,8 @@ class Penalty(NamedTuple):
         candidates: for lambda, as many for each penalty: a lambda means another thing in each.
         bounded: whether lambda times the penalty is bounded for any lambda, so that the loss is not
             divided by lambda.
-        version: a change that alters its results must raise it. It is part of the keys.
+        version: a change that alters its results must raise it. It is part of the keys of learned
+            rewards. The stages of the controls have versions of their own: raise them, too.
     """
 
     module: str

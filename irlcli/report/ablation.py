@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from irlcli.report.agents import title
+from irlcli.report.compute import whole_seeds
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.statistics import holm, paired_p, summarise
 from irlcli.report.tables import Table
@@ -39,14 +40,14 @@ def shares(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
 
     Columns: ``row``, ``agent``, ``measure`` (``transfer-id`` or ``id``), ``setting``, ``seed``;
     ``share`` of the expert's true return and ``progress_share`` of its progress, each the mean of
-    its retrainings, missing unless the expert's is positive.
+    its retrainings, missing unless the expert's is positive. A seed that lacks a retraining in a
+    setting has no row there.
     """
     own = points[(points["agent"] == "expert") & (points["measure"] == "id")]
     columns = ["true_return", "progress"]
     experts = own.set_index(["row", "setting"])[columns].astype(float)
-    measured = points[
-        points["agent"].isin(p.methods) & points["measure"].isin((_RETRAINED, _STUDENT))
-    ]
+    whole = whole_seeds(p, points)
+    measured = whole[whole["agent"].isin(p.methods) & whole["measure"].isin((_RETRAINED, _STUDENT))]
     keys = ["row", "agent", "measure", "setting", "seed"]
     earned = measured.astype({"seed": int, "true_return": float, "progress": float})
     means = earned.groupby(keys, sort=False)[columns].mean().reset_index()

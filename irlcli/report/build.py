@@ -92,7 +92,7 @@ def build(
     ]
     found = [
         *caveats.missing(p),
-        *caveats.weak_experts(cells),
+        *caveats.weak_experts(p, cells, assessments),
         *caveats.not_imitated(cells),
         *caveats.short_of_expert(learned_returns),
         *caveats.yardsticks(cells, verdicts=not (learned_returns.empty and quality.empty)),

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from irlcli.report.agents import title
-from irlcli.report.compute import IMITATED, failed_to_imitate
+from irlcli.report.compute import IMITATED, Assessments, failed_to_imitate
 from irlcli.report.lineage import evaluations, is_mixed, lineage, origins, short
-from irlcli.report.parameters import Cell, Code, Parameters
+from irlcli.report.parameters import Cell, Code, Parameters, has_held_out
 from irlcli.report.statistics import identical_runs
 from irlcli.report.text import percent
 
@@ -66,18 +66,24 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
     return found
 
 
-def weak_experts(cells: pd.DataFrame) -> list[str]:
-    """Experts that earn no more than the random agent, against which no verdict means anything."""
-    means = cells.set_index(["row", "measure", "agent"])["mean"]
-    found = []
-    for (row, measure), of in means.groupby(level=["row", "measure"], sort=False):
-        expert, random = (of.get((row, measure, agent)) for agent in ("expert", "random"))
+def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -> list[str]:
+    """Experts that earn no more than the random agent, against which no verdict means anything.
+
+    A table without a measure in the held-out setting says nothing about its expert.
+    """
+    weak: dict[tuple[str, str], None] = {}
+    for (assessed, _, _), assessment in assessments.items():
+        weak |= dict.fromkeys((assessed, setting) for setting in assessment.weak_settings)
+    means = cells[cells["measure"] == "ood"].set_index(["row", "agent"])["mean"]
+    for row in p.rows if has_held_out(p.measures) else ():
+        expert, random = (means.get((row.name, agent)) for agent in ("expert", "random"))
         if expert is not None and random is not None and expert <= random:
-            found.append(
-                f"Weak expert: {row}: the expert earns {expert:.1f}, no more than the random agent's "
-                f"{random:.1f}. Shares of the expert and verdicts mean nothing here."
-            )
-    return found
+            weak[row.name, row.unseen] = None
+    return [
+        f"Weak expert: {name}: in {setting} the expert earns no more than the random agent. Shares of "
+        "the expert and verdicts mean nothing there."
+        for name, setting in weak
+    ]
 
 
 def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:

@@ -67,6 +67,17 @@ def whole_sample(
     return sample(points, row, agent, measure).drop(lacking, errors="ignore")
 
 
+def whole_seeds(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
+    """``points`` without those of a seed that lacks a retraining in the same setting.
+
+    Points of agents without seeds stay.
+    """
+    lacking = {(c.row, c.agent, c.measure, c.place, c.seed) for c in p.cells if not c.run}
+    columns = ["row", "agent", "measure", "setting", "seed"]
+    kept = [key not in lacking for key in points[columns].itertuples(index=False, name=None)]
+    return points[kept]
+
+
 def points_of(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.DataFrame:
     """The points of one row, agent and measure."""
     of = (points["row"] == row) & (points["agent"] == agent) & (points["measure"] == measure)
@@ -254,7 +265,8 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
 
     Columns: ``row``, ``agent``, ``setting``, ``seed``; ``spearman`` and ``spearman_low`` over the
     bank and over its lower half; ``expert_minus_idle`` per step; ``return_distance``; ``verdicts``
-    on the policies retrained there from scratch, one for each retraining.
+    on the policies retrained there from scratch, one for each retraining, none where the expert is
+    no better than the random agent.
     """
 
     def value(found: Interval | None) -> float | None:
@@ -270,13 +282,17 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
             "spearman_low": value(s.lower_half.spearman),
             "expert_minus_idle": s.expert_minus_idle and s.expert_minus_idle.mean,
             "return_distance": s.return_distance,
-            "verdicts": [r.verdict for r in s.retrained if not r.from_student],
+            "verdicts": [
+                r.verdict
+                for r in s.retrained
+                if not r.from_student and s.setting not in of.weak_settings
+            ],
         }
         for row in p.rows
         for method in p.methods
         for seed in p.seeds
-        if (row.name, method, seed) in assessments
-        for s in assessments[row.name, method, seed].settings
+        if (of := assessments.get((row.name, method, seed))) is not None
+        for s in of.settings
     ]
     columns = ["row", "agent", "setting", "seed", "spearman", "spearman_low", "expert_minus_idle"]
     return pd.DataFrame(found, columns=[*columns, "return_distance", "verdicts"])

@@ -4,9 +4,12 @@ These are parameters of the stages ``report`` and ``report-experts``. Importing 
 heavy, because planning a report needs them.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
+
+from irlcli.report.agents import IN_DISTRIBUTION
 
 # The measure of cells in which the held-out setting's expert is scored by a learned reward.
 EXPERT_BY_REWARD = "expert by reward"
@@ -14,6 +17,11 @@ EXPERT_BY_REWARD = "expert by reward"
 ASSESS = "assess"
 # The measure of cells that hold no returns but how a learned reward depends on a cue.
 CUE = "cue"
+
+
+def has_held_out(measures: Sequence[str]) -> bool:
+    """Whether some of ``measures`` are taken in the held-out setting."""
+    return not set(measures) <= {*IN_DISTRIBUTION, ASSESS, CUE}
 
 
 class Cell(msgspec.Struct, frozen=True):

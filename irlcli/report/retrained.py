@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from irlcli.report.compute import points_of, whole_sample
+from irlcli.report.compute import points_of, whole_sample, whole_seeds
 from irlcli.report.parameters import Parameters
 from irlcli.report.statistics import paired_p, summarise
 
@@ -16,19 +16,20 @@ def by_training_setting(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """Policies retrained in each training setting, a row per row, setting and method.
 
     Columns: ``row``, ``setting``, ``agent``, ``seeds``; ``mean`` and ``deviation`` (n - 1) of the
-    true return over seeds, each the mean of its retrainings; ``progress``, its mean; ``expert``,
+    true return over seeds that have all their retrainings there, each the mean of them; ``progress``, its mean; ``expert``,
     the return of that setting's own expert; ``of_expert``, the mean over it, None unless the
     expert's is positive.
     """
     columns = ["row", "setting", "agent", "seeds", "mean", "deviation", "progress"]
     columns += ["expert", "of_expert"]
     found = []
+    whole = whole_seeds(p, points)
     for row in p.rows if "transfer-id" in p.measures else ():
         experts = points_of(points, row.name, "expert", "id").set_index("setting")["true_return"]
         for setting in row.trained:
             expert = experts.get(setting)
             for method in p.methods:
-                of = points_of(points, row.name, method, "transfer-id")
+                of = points_of(whole, row.name, method, "transfer-id")
                 by_seed = of[of["setting"] == setting].groupby("seed")
                 means = by_seed[["true_return", "progress"]].mean()
                 if means.empty:

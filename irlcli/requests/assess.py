@@ -74,7 +74,11 @@ def assess(
     )
     retrain = None
     if not any(policies.retrained.values()):
-        retrain = session.suggestion("transfer", "--reward", reward, "--setting", str(settings[0]))
+        own = environment(origin.env).own
+        named = () if own is None else ("--env", own.source)
+        retrain = session.suggestion(
+            "transfer", "--reward", reward, *named, "--setting", str(settings[0])
+        )
     return Assessing(request, retrain)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -11,7 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from irlcli.configs import PROFILES, Config, PPOConfig, load_config
-from irlcli.configs.relevance import relevant_airl, relevant_ppo
+from irlcli.configs.relevance import relevant_airl, relevant_ppo, relevant_transfer
+from irlcli.configs.schema import SACConfig, TransferConfig
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
@@ -524,6 +526,17 @@ def test_retraining_is_as_strong_as_the_experts_training(env):
             assert transfer.ppo == msgspec.structs.replace(expert.ppo, **own)
 
 
+def test_a_training_without_an_update_is_refused():
+    relevant = partial(relevant_transfer, discrete_actions=False, from_student=False)
+    sac = TransferConfig(algorithm="sac", total_steps=1000, sac=SACConfig(n_envs=2, n_steps=100))
+    begins = [msgspec.structs.replace(sac.sac, learning_starts=n) for n in (999, 1000)]
+    assert relevant(msgspec.structs.replace(sac, sac=begins[0])).sac == begins[0]
+    with pytest.raises(UsageError, match="leaves no update: training has 1000 steps"):
+        relevant(msgspec.structs.replace(sac, sac=begins[1]))
+    with pytest.raises(UsageError, match=r"transfer\.ppo: one world and one step"):
+        relevant(TransferConfig(ppo=PPOConfig(n_envs=1, n_steps=1)))
+
+
 def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():
     (legs,) = parse_settings("ant", "leg-length=3x")
     (friction,) = parse_settings("ant", "friction=2:0.6:0.6")
@@ -533,6 +546,20 @@ def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():
     assert not plain.transfer_of(legs).ppo.use_sde
     sac = load_config("ant", flags={"transfer.algorithm": "sac"})
     assert {sac.transfer_of(s).algorithm for s in (legs, friction)} == {"sac"}
+
+
+def test_none_unsets_a_field_that_the_settings_set(toml):
+    (friction,) = parse_settings("ant", "friction=1.5:0.1:0.1")
+    listed = load_config("ant").airl_of(friction)
+    assert listed.averaged_rounds == 30
+    for source in (
+        {"overrides": ["airl.averaged_rounds=none"]},
+        {"file": toml('[airl]\naveraged_rounds = "none"')},
+    ):
+        found = load_config("ant", **source).airl_of(friction)
+        assert found == msgspec.structs.replace(listed, averaged_rounds=msgspec.UNSET)
+    with pytest.raises(UsageError, match="expected a whole number"):
+        load_config("ant", overrides=["airl.averaged_rounds=some"])
 
 
 def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):

@@ -18,17 +18,20 @@ EXPERTS = {FIRST: (200.0, 50.0), SECOND: (100.0, 20.0)}
 
 
 def ablation(returns, experts=EXPERTS):
-    """The report; ``returns`` maps (variant, measure, setting) to a return for each seed."""
+    """The report; ``returns`` maps (variant, measure, setting) to a return for each seed.
+
+    In place of a return there may be a list: one for each retraining.
+    """
     points, cells = [], []
 
-    def add(agent, measure, setting, seed, value, progress):
+    def add(agent, measure, setting, seed, value, progress, retraining=0):
         run = "" if value is None else f"{len(cells):016x}"
         why = "" if run else "transfer has not run"
         place = setting if measure == "transfer-id" else ""
-        cells.append(Cell(BOUNCE, agent, measure, seed, place, run, why))
+        cells.append(Cell(BOUNCE, agent, measure, seed, place, run, why, retraining))
         if run:
             point = {"row": BOUNCE, "agent": agent, "measure": measure, "seed": seed}
-            point |= {"retraining": 0, "setting": setting, "true_return": value}
+            point |= {"retraining": retraining, "setting": setting, "true_return": value}
             point |= {"progress": progress, "learned_return": None, "episodes": 20}
             points.append(point | {"evaluation": run})
 
@@ -36,7 +39,8 @@ def ablation(returns, experts=EXPERTS):
         add("expert", "id", setting, None, value, progress)
     for (variant, measure, setting), values in returns.items():
         for seed, value in enumerate(values):
-            add(variant, measure, setting, seed, value, 10.0)
+            for retraining, each in enumerate(value if isinstance(value, list) else [value]):
+                add(variant, measure, setting, seed, each, 10.0, retraining)
     p = Parameters(
         kind="retraining",
         title="Parts",
@@ -68,6 +72,19 @@ RETURNS = {
     ("no challengers", "transfer-id", FIRST): [100.0, 140.0, 180.0],
     ("no challengers", "transfer-id", SECOND): [50.0, 60.0, None],
 }
+
+
+def test_a_seed_that_lacks_a_retraining_is_not_compared():
+    returns = RETURNS | {
+        ("full", "transfer-id", FIRST): [[180.0, 160.0], [190.0, 170.0], [200.0, None]],
+        ("full", "transfer-id", SECOND): [[72.0] * 2, [87.0] * 2, [98.0] * 2],
+    }
+    report = ablation(returns)
+    full = report.variants.set_index("agent").loc["full"]
+    assert full["seeds"] == 2 and full["mean"] == pytest.approx(np.mean([0.785, 0.885]))
+    first = report.by_training_setting
+    first = first[(first["agent"] == "full") & (first["setting"] == FIRST)]
+    assert first[["seeds", "mean"]].values.tolist() == [[2, 175.0]]
 
 
 def test_returns_are_shares_of_the_settings_own_expert():

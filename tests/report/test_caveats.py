@@ -35,6 +35,10 @@ def test_an_expert_no_better_than_the_random_agent(expert, weak):
     found = build(*example(returns), {}, {}).caveats
     assert any(c.startswith(f"Weak expert: {BOUNCE}: ") for c in found) == weak
     assert not any(c.startswith(f"Weak expert: {POWER}: ") for c in found)
+    # A table of the training settings says nothing about the held-out one.
+    p, points = example(returns)
+    seen = build(replace(p, measures=("id",)), points, {}, {}).caveats
+    assert not any(c.startswith("Weak expert") for c in seen)
 
 
 def test_a_saturated_discriminator():

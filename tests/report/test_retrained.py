@@ -125,6 +125,12 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
     p, points = example(complete())
     report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): assessment})
     assert report.reward_quality["verdicts"].tolist() == [["retrained"]]
+    # Beside an expert that earns no more than the random agent, a verdict says nothing.
+    members[1] = member("random", "random", 100.0)
+    weak = assess("lunar-lander", reward, members, {})
+    report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): weak})
+    assert report.reward_quality["verdicts"].tolist() == [[]]
+    assert any("bounce=0.9 the expert earns no more" in caveat for caveat in report.caveats)
 
 
 def test_the_budget_of_retraining_from_the_student_is_listed():
