@@ -6,7 +6,8 @@ an exit status. Every other exception that reaches the command line is a bug.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 RETRY = "No partial output was written. Fix the problem and run the same command again."
 
@@ -76,6 +77,22 @@ class Interrupted(IrlError):
     """A signal stopped the run after a checkpoint was written (exit 130)."""
 
     exit_code = 130
+
+
+@contextmanager
+def importing(what: str, module: str) -> Iterator[None]:
+    """Import ``module``, which ``what`` is registered with.
+
+    Raises:
+        StageFailed: it, or what it imports, is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise StageFailed(
+            f"{what}: {module} cannot be imported ({error})",
+            "install its package, or name its folder in PYTHONPATH",
+        ) from error
 
 
 def file_failure(error: OSError) -> StageFailed:

@@ -11,6 +11,7 @@ import pytest
 from irlcli import learners, penalties, rl
 from irlcli.envs import registry
 from irlcli.experiments.runner import Runner
+from irlcli.experiments.status import source_of
 from irlcli.stages.base import From
 from irlcli.store import Store
 
@@ -137,11 +138,8 @@ def test_a_stage(lab, store_copy):
     from lab import count_steps
 
     runner = Runner(store_copy.path)
-    demos = runner.store.resolve("demos").artefact
-    from irlcli.experiments.status import source_of
-    from irlcli.store import Resolved
-
-    source = source_of(Resolved(demos, demos.directory))
+    resolved = runner.store.resolve("demos")
+    demos, source = resolved.artefact, source_of(resolved)
     first, again = (runner.run(count_steps.request(source)) for _ in range(2))
     assert first.id == again.id
     steps = int((first.directory / "steps.txt").read_text())

@@ -8,7 +8,7 @@ import pytest
 from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
 from irlcli.store import Store
 
-pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'irlcli[mujoco]'")
+pytest.importorskip("mujoco", reason="needs MuJoCo: pip install '.[mujoco]'")
 
 HOPPER = "mujoco-hopper"
 SMALL = [
@@ -101,7 +101,7 @@ def test_a_missing_library_is_one_line_with_the_command_that_installs_it(
     assert done.code == 1 and done.out == ""
     error, hint = done.err.splitlines()[-2:]
     assert error.endswith(f": {robot} needs MuJoCo, which is not installed")
-    assert hint == "hint: pip install 'irlcli[mujoco]'"
+    assert hint == "hint: pip install '.[mujoco]' in irlcli's checkout"
 
 
 def test_a_broken_library_is_one_line_too(tmp_path, irl, monkeypatch):

@@ -41,7 +41,7 @@ def environment(name: str) -> EnvironmentSpec:
     if spec is not None:
         return introduce(spec)
     hint = suggest(name, [*ENVIRONMENTS, *_KNOWN, *announced()])
-    raise UsageError(f"unknown environment {name!r}", f"{hint}; or name a TOML file with --env")
+    raise UsageError(f"unknown environment {name!r}", f"{hint}; or give a TOML file")
 
 
 def resolve(ref: str) -> EnvironmentSpec:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from irlcli.errors import importing
+
 
 class Learner(NamedTuple):
     """Where an adversarial learner's class is, and what is part of its definition.
@@ -26,7 +28,13 @@ LEARNERS = {
 
 
 def learner(name: str) -> Any:
-    """The learner class called ``name``, one of :data:`LEARNERS`."""
+    """The learner class called ``name``, one of :data:`LEARNERS`.
+
+    Raises:
+        StageFailed: its module cannot be imported.
+    """
     from pkgutil import resolve_name
 
-    return resolve_name(LEARNERS[name].place)
+    place = LEARNERS[name].place
+    with importing(f"learner {name!r}", place):
+        return resolve_name(place)

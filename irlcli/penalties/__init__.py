@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from irlcli.errors import StageFailed, UsageError, suggest
+from irlcli.errors import UsageError, importing, suggest
 from irlcli.methods import METHODS
 
 if TYPE_CHECKING:
@@ -211,10 +211,5 @@ def occupancy_penalty(name: str) -> "Callable[[Occupancies], tuple[np.ndarray, n
 
 def _module(name: str) -> Any:
     path = PENALTIES[name].module
-    try:
+    with importing(f"penalty {name!r}", path):
         return import_module(path)
-    except ModuleNotFoundError as error:
-        raise StageFailed(
-            f"penalty {name!r}: {path} cannot be imported ({error})",
-            "install its package, or name its folder in PYTHONPATH",
-        ) from error

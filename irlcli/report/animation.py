@@ -121,7 +121,8 @@ def write_mp4(path: Path, played: Film) -> None:
         from imageio_ffmpeg import write_frames
     except ImportError:
         raise StageFailed(
-            "MP4 needs imageio-ffmpeg", "pip install 'irlcli[video]', or write a .gif"
+            "MP4 needs imageio-ffmpeg",
+            "pip install '.[video]' in irlcli's checkout, or write a .gif",
         ) from None
     writer = write_frames(str(path), played.size, fps=1.0 / played.seconds, quality=8)
     with closing(writer):

@@ -5,6 +5,8 @@ Importing it loads neither torch nor stable-baselines3.
 
 from typing import Any
 
+from irlcli.errors import importing
+
 # Name to module and class, one line each. A class takes (worlds, config, total_steps, seed, purpose)
 # and, for --start student, ``keep_moments``; it is a :class:`irlcli.rl.loop.Trainer`. All but SAC are
 # configured by ``transfer.ppo``.
@@ -15,7 +17,13 @@ ALGORITHMS = {
 
 
 def algorithm(name: str) -> Any:
-    """The trainer class called ``name``, one of :data:`ALGORITHMS`."""
+    """The trainer class called ``name``, one of :data:`ALGORITHMS`.
+
+    Raises:
+        StageFailed: its module cannot be imported.
+    """
     from pkgutil import resolve_name
 
-    return resolve_name(ALGORITHMS[name])
+    place = ALGORITHMS[name]
+    with importing(f"algorithm {name!r}", place):
+        return resolve_name(place)

@@ -129,5 +129,5 @@ def test_without_ffmpeg_the_message_says_what_to_install(irl, smoke_store, tmp_p
     out = tmp_path / "a.mp4"
     out.write_text("old")
     done = irl("play", "airl", "--out", out, "--steps", "2", "--store", smoke_store.path)
-    assert "irlcli[video]" in assert_answered(done, 1, "imageio-ffmpeg") + done.err
+    assert ".[video]" in assert_answered(done, 1, "imageio-ffmpeg") + done.err
     assert out.read_text() == "old"

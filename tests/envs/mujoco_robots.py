@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'irlcli[mujoco]'")
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install '.[mujoco]'")
 
 from irlcli.envs.mujoco.env import Ant, HalfCheetah, Hopper, Humanoid, Walker2d  # noqa: E402
 

@@ -267,7 +267,8 @@ def _storage_class() -> Any:
         from minari.dataset.minari_storage import MinariStorage
     except ImportError as error:
         raise StageFailed(
-            f"{error.name or 'Minari'} is not installed", "pip install 'irlcli[minari]'"
+            f"{error.name or 'Minari'} is not installed",
+            "pip install '.[minari]' in irlcli's checkout",
         ) from None
     return MinariStorage
 

@@ -6,7 +6,7 @@ with other masses, joint limits, actuators and friction.
 
 from irlcli.envs.spec import EnvironmentSpec, Knob, Needs
 
-MUJOCO = Needs("mujoco", "MuJoCo", "pip install 'irlcli[mujoco]'")
+MUJOCO = Needs("mujoco", "MuJoCo", "pip install '.[mujoco]' in irlcli's checkout")
 
 
 def _knobs(legs: str) -> dict[str, Knob]:
