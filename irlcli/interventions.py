@@ -150,10 +150,10 @@ def examples_of(knob: Knob) -> str:
 
 
 def _allowed(knob: Knob) -> str:
-    """The range of a knob: ``must be 0 or 1``, ``must be 0, 1, 2 or 3``, ``must lie in 0.1 to 8``."""
+    """The range of a knob: ``must be 0 or 1``, ``must be 0, 1, 2 or 3``, ``must be between 0.1 and 8``."""
     low, high = _format(knob.low), _format(knob.high)
     if not knob.whole:
-        return f"must lie in {low} to {high}"
+        return f"must be between {low} and {high}"
     if not knob.high - knob.low < 10:
         return f"must be a whole number from {low} to {high}"
     *others, last = [str(n) for n in range(int(knob.low), int(knob.high) + 1)]
@@ -173,6 +173,8 @@ def parse_value(env: str, knob: str, text: str) -> Value:
         if match is None:
             continue
         if form not in spec.forms:
+            if form == "absolute" and "multiplier" in spec.forms:
+                examples = f"{text.strip()}x"
             raise UsageError(
                 f"{knob}={text.strip()!r}: {env} takes {knob} as {' or '.join(spec.forms)}, "
                 f"not as {form}",
@@ -322,7 +324,8 @@ def parse_setting(env: str, text: str) -> Setting:
         settings = parse_settings(env, text)
         if len(settings) != 1:
             raise UsageError(
-                f"{text!r} names {len(settings)} settings, but one is needed", "name one"
+                f"{text!r} names {len(settings)} settings, but one is needed",
+                "name one; several knobs of one setting are KNOB=VALUE,KNOB=VALUE",
             )
         return settings[0]
     changes = sorted(change for part in parts for change in parse_settings(env, part)[0].changes)
@@ -334,7 +337,8 @@ def parse_setting(env: str, text: str) -> Setting:
         if argument in arguments:
             both = f"{arguments[argument]} and {knob}" if arguments[argument] != knob else knob
             raise UsageError(
-                f"{text!r} changes {argument} twice, by {both}", "change each thing once"
+                f"{text!r} sets {argument} twice, by {both}",
+                "a setting has one value of each knob; repeat --setting for another setting",
             )
         arguments[argument] = knob
         if spec.observed and added.setdefault(spec.observed, knob) != knob:

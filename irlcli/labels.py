@@ -1,4 +1,4 @@
-"""The words that tell artefacts of one stage apart. Listings, plans, lineages and reports use them.
+"""Short descriptions that distinguish artefacts of one stage. Listings, plans, lineages and reports use them.
 
 They come from parameters as they are stored. These may have been written by hand, so no form is
 assumed.

@@ -168,7 +168,7 @@ def test_absurd_values_are_refused_with_the_range(knob, text):
     with pytest.raises(UsageError, match="out of range") as caught:
         parse_value(LANDER, knob, text)
     assert repr(text) in caught.value.message
-    assert " to " in caught.value.hint and knob in caught.value.hint
+    assert " and " in caught.value.hint and knob in caught.value.hint
 
 
 @pytest.mark.parametrize("text", ["1e400", "-1e400"])
@@ -319,7 +319,7 @@ def test_a_setting_of_several_knobs_reads_back_in_any_order(numbers, data):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("plain=1,plain=2", "changes plain twice, by plain"),
+        ("plain=1,plain=2", "sets plain twice, by plain"),
         ("plain=1,double=", "not an intervention"),
         ("plain=1,other=2", "no intervention 'other'"),
         ("plain=1,2,double=2x", "values of two knobs, plain and double"),

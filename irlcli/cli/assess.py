@@ -28,7 +28,9 @@ def assess(
     setting: OneSetting = [],  # noqa: B006
     demos: Annotated[
         str | None,
-        typer.Option(help="Demonstrations for the ladder of noise. Default: the reward's own."),
+        typer.Option(
+            help="Demonstrations to clone for the noisy policies. Default: the reward's own."
+        ),
     ] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each policy.")] = None,
     env: Env = None,

@@ -166,7 +166,7 @@ class TerminalConsole:
 
 
 def printable(text: str) -> str:
-    """``text`` as one line that controls nothing."""
+    """``text`` as one line without control characters."""
     # Almost always there is nothing to translate, which takes a hundred times as long.
     return text if text.isascii() and text.isprintable() else text.translate(_CONTROLS)
 

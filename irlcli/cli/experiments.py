@@ -41,18 +41,21 @@ ChoosePenalty = Annotated[
 ]
 _Until = Annotated[
     str | None,
-    typer.Option(help="Last phase: experts, demos, rewards, transfers or returns. No report."),
+    typer.Option(
+        help="Stop after this phase, without a report: experts, demos, rewards, transfers or returns."
+    ),
 ]
 _Only = Annotated[str | None, typer.Option(metavar="NAME", help="One step and what it needs.")]
-_Tag = Annotated[str | None, typer.Option(help="What all names begin with. Default: the profile.")]
+_Tag = Annotated[str | None, typer.Option(help="Prefix of all names. Default: the profile.")]
 TableFile = Annotated[
-    Path | None, typer.Option("--experiments", help="Tables, instead of settings/experiments.toml.")
+    Path | None,
+    typer.Option("--experiments", help="File with the tables. Default: settings/experiments.toml."),
 ]
 
 _JOBS = "Jobs of a cluster"
 _CONTINUE = "run the same command again to continue"
 _JOBS_GO_ON = (
-    "the jobs go on: --status shows them, --cancel stops them, the same command waits again"
+    "the jobs continue: --status shows them, --cancel stops them, the same command waits again"
 )
 
 
@@ -175,7 +178,7 @@ def run(
         int | None,
         typer.Option(
             min=0,
-            help=f"How often a stopped job may go on. Default: {cluster_jobs.DEFAULT_REQUEUES}.",
+            help=f"How often a stopped job is requeued. Default: {cluster_jobs.DEFAULT_REQUEUES}.",
             rich_help_panel=_JOBS,
         ),
     ] = None,
@@ -193,7 +196,7 @@ def run(
 
     Each missing step is made by a process of its own: this command with --only NAME. Run it again
     after a failure or an interruption: finished steps are kept, interrupted ones resume. With
-    --cluster the processes are jobs; --status and --cancel are about those of the same table.
+    --cluster each step is a job; --status and --cancel apply to the jobs of this table.
     """
     choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     options = ClusterOptions(
@@ -253,8 +256,8 @@ def _check_options(
     other = session.file or session.overrides or choice.choose_penalty is not None
     if choice.tag is None and other:
         raise UsageError(
-            "--settings, --set and --choose-penalty make other artefacts than the profile alone",
-            "name them: --tag NAME",
+            "results with --settings, --set or --choose-penalty need names of their own",
+            "add --tag NAME",
         )
     if choice.only is not None and (choice.until or directory or options.jobs):
         raise UsageError("--only takes no --until, --out or --jobs", "omit them: it makes one step")

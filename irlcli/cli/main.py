@@ -89,7 +89,7 @@ def _usage(error: Any) -> UsageError:
     message = re.sub("a valid int(eger)?( range)?$", "a whole number", message)
     message = re.sub("a valid float( range)?$", "a number", message)
     extra = re.match(r"^Got unexpected extra argument.*? \((.*)\)$", message)
-    hint = f"`{path} --help` lists what it accepts"
+    hint = f"`{path} --help` lists {'the commands' if path == 'irl' else 'what it accepts'}"
     if extra:
         message = f"Unexpected argument: {extra[1]}"
         if {"--rows", "--seeds", "--methods"} & set(sys.argv):

@@ -132,7 +132,7 @@ class StageSession(base.StageSession):
         self._prepared: list[Request] = []
 
     def place_words(self) -> list[str]:
-        """The options that give another command line the same stores and the same way to work."""
+        """The options that make another command use the same stores, waiting and workers."""
         # A cluster's job may not inherit IRL_STORE.
         plain = self.store.root == DEFAULT_STORE and not os.environ.get("IRL_STORE")
         words = [] if plain else ["--store", str(self.store.root)]

@@ -46,13 +46,16 @@ def train_airl(
     choose_penalty: Annotated[
         str | None,
         typer.Option(
-            help="Candidates for lambda, e.g. 0.1,1,10, or own for the penalty's; compared in a "
-            "setting left out of training."
+            help="Choose lambda among these, e.g. 0.1,1,10, by leaving one setting out of training. "
+            "own: the penalty's own candidates."
         ),
     ] = None,
     select: Annotated[
         str | None,
-        typer.Option(help="Round to keep: last, or the best on episodes or in SETTING."),
+        typer.Option(
+            help="Round to keep: last; episodes (the best on held-out episodes); or SETTING (the best "
+            "in that setting, which is left out of training)."
+        ),
     ] = None,
     state_only: Annotated[
         bool | None,

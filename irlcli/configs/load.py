@@ -363,7 +363,7 @@ def _override(item: str) -> dict[str, Any]:
     dotted, equals, text = item.partition("=")
     path = dotted.strip().split(".")
     if not equals:
-        raise UsageError(f"--set {item!r} has no '='", "write --set airl.penalty_weight=30")
+        raise UsageError(f"--set {item!r} has no '='", f"write --set {dotted.strip()}=VALUE")
     kind: Any = Config
     for i, name in enumerate(path):
         if not (isinstance(kind, type) and issubclass(kind, Struct)):

@@ -100,7 +100,7 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
 
 
 def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
-    """``airl`` without what its method, replay, selection and actions leave unused.
+    """``airl`` with every field reset that its method, replay, selection and actions do not use.
 
     Raises:
         UsageError: an unknown learner or penalty, or an option that does not fit the actions.
@@ -228,7 +228,7 @@ def _replay(airl: AIRLConfig) -> AIRLConfig:
 def relevant_transfer(
     transfer: TransferConfig, discrete_actions: bool, from_student: bool
 ) -> TransferConfig:
-    """``transfer`` without what its algorithm and its start leave unused.
+    """``transfer`` with every field reset that its algorithm and its start do not use.
 
     A policy that begins as the student has its network and its actions' deviation, takes the
     budget and the learning rate of ``transfer.from_student``, and has no restarts.
@@ -289,7 +289,7 @@ def _check_updated(sac: SACConfig, total_steps: int) -> None:
 
 
 def relevant_maxent(maxent: MaxEntConfig) -> MaxEntConfig:
-    """``maxent`` without what its penalty and its features leave unused.
+    """``maxent`` with every field reset that its penalty and its features do not use.
 
     Raises:
         UsageError: a penalty that MaxEnt IRL does not have, or a warm-up that leaves it no iteration.

@@ -244,12 +244,12 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             all (``pooled``). Without effect where ``grouping`` is ``pooled``: there each setting has
             its demonstrations' share of the policy's samples.
         policy_reward: ``f-log-pi`` (Algorithm 1), ``f`` or ``g``.
-        fixed_horizon: an episode that ends early goes on in an absorbing state.
+        fixed_horizon: an episode that ends early continues in an absorbing state.
         actions: what g and log pi see: the policy's samples (``sampled``), or what the environment
             clips them to (``executed``).
         bc_epochs: epochs of behavioural cloning before the first round.
         dropout: probability that a hidden unit of the discriminator is left out of an update. Unset
-            is none. The field is younger than the keys of many rewards, and unset it is in no key.
+            is none, and in no key, so that rewards made before this field existed keep their keys.
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Unset (or empty) is all, and in no key.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,

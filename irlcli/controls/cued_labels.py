@@ -1,4 +1,4 @@
-"""Classification problems with a cue that turns: Colored MNIST without images, and linear ones.
+"""Classification problems with a cue that reverses: Colored MNIST without images, and linear ones.
 
 Every function returns samples [R, E, 2, B, D] float32: R runs, E settings, labels 0 and 1, B samples
 of each.

@@ -197,7 +197,10 @@ def _read(path: Path) -> Any:
             "files of irlcli hold tensors only; do not trust the source of this one",
         ) from None
     except ValueError as error:
-        raise IntegrityError(f"{path} is not a tensor file ({error})") from None
+        raise IntegrityError(
+            f"{path} is not a file of a reward or a policy ({error})",
+            "name a reward.pt or policy.pt, or the artefact of `irl train-airl` or `irl transfer`",
+        ) from None
     except OSError as error:
         raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
 

@@ -1,4 +1,4 @@
-"""A cue that tells how well it goes, with a strength that differs between settings.
+"""A hint of how well the agent does, with a strength that differs between settings.
 
 The positive control for invariant rewards. Every step has a *quality*: good or bad, by the true
 rewards of the last steps (:class:`irlcli.envs.spec.Cue`). It is not observed. Two hints are, as the
@@ -93,7 +93,7 @@ class CueWorld(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; without a seed, the draws go on where the last episode ended."""
+        """Start an episode; without a seed, the draws continue where the last episode ended."""
         if seed is not None:
             self._rightness = Rightness(self._strength, seed)
         self._sums = [0.0]

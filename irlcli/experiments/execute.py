@@ -26,7 +26,7 @@ _SEVERITY = (75, 130, 3, 2, 1, 4)
 
 
 class Outcome(NamedTuple):
-    """What became of the steps, by name."""
+    """The result of each step, by name."""
 
     existed: list[str]
     copied: list[str]

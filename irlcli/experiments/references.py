@@ -172,7 +172,10 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
         if not any((Path(ref) / name).exists() for name in (EPISODES, STEPS)):
             hint = f"name an artefact, or a directory of demonstrations; {store.listing}"
             if Path(ref).is_file():
-                hint = f"`irl import {ref}` makes demonstrations of a recording"
+                hint = (
+                    f"`irl import {ref} --env ENV --intervention KNOB=VALUE` turns a recording into "
+                    "demonstrations"
+                )
             raise NotFound(f"{ref!r} is neither an artefact nor a directory with {EPISODES}", hint)
         demos = read_demonstrations(Path(ref))
         return source_of(resolved), demos.env, list(demos.trajectories)

@@ -151,7 +151,7 @@ class Record(NamedTuple):
     """Diagnostics of one iteration, before its update.
 
     The likelihood is rho_E . phi - log Z, the log-likelihood in expectation over the dynamics: with few
-    episodes it differs from sum log pi by the luck of their successors
+    episodes it differs from sum log pi by the randomness of the transitions
     (:func:`irlcli.learners.tabular_quality.log_likelihood` has the latter). It covers the whole
     horizon. A choice in the absorbing goal is as likely as any other, so each step there costs log A
     nats. Compare it within a run only.

@@ -80,7 +80,7 @@ def film(
         if "rgb_array" not in worlds[0].metadata.get("render_modes", ()):
             raise UsageError(
                 f"{env} draws no pictures",
-                'irl play needs an environment whose metadata list the render mode "rgb_array"',
+                'irl play needs an environment whose metadata lists the render mode "rgb_array"',
             )
         rate = worlds[0].metadata.get("render_fps", _FRAMES_PER_SECOND)
         stride = max(1, round(rate / _FRAMES_PER_SECOND))

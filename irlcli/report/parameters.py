@@ -102,7 +102,7 @@ class Code(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Run(msgspec.Struct, frozen=True, kw_only=True):
-    """The provenance of one artefact; None where it does not tell.
+    """The provenance of one artefact; None if unknown.
 
     Attributes:
         about: environment, settings, method and agent, for people.

@@ -112,7 +112,9 @@ def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
         )
     if origin is None or text in environment(env).knobs:
         knob_of(env, text)
-        raise UsageError(f"{text!r} names no value", f"write {text}=VALUE,VALUE")
+        raise UsageError(
+            f"the settings of {env} list no values of {text!r}", f"write {text}=VALUE,VALUE"
+        )
     knobs = parse_setting(env, origin.settings[0]).knobs
     if len(knobs) != 1:
         hint = "write KNOB=VALUE, or --setting KNOB=VALUE,KNOB=VALUE"

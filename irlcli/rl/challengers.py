@@ -2,7 +2,7 @@
 
 Each is trained on the reward of that moment, as a retrained policy will be on the final one. What
 they do becomes negatives of the discriminator. So the reward rises from where a new policy begins,
-and poses that it would overpay are corrected before it is frozen.
+and poses that it would score too high are corrected before it is frozen.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def request(
     weights: Sequence[float] | Literal["own"],
     seed: int = 0,
 ) -> Request:
-    """The one of ``weights`` whose students do best in the settings left out, on average.
+    """Choose the weight whose students have the best mean return in the left-out settings.
 
     ``own`` are those that :data:`irlcli.penalties.PENALTIES` has for the penalty of ``airl``.
 

@@ -1,4 +1,4 @@
-"""A behavioural clone of demonstrations: the policy that noise turns into a ladder of quality."""
+"""A behavioural clone of demonstrations: with noise added to its actions, it gives policies of graded quality."""
 
 from collections.abc import Sequence
 

@@ -80,7 +80,7 @@ def request(
     if len(counts) == 1:
         counts *= len(settings)
     if min(counts) < 1:
-        raise UsageError(f"{min(counts)} episodes are no demonstrations", "record at least 1")
+        raise UsageError("the number of episodes must be at least 1", f"it is {min(counts)}")
     if len(counts) != len(settings):
         raise UsageError(
             f"{len(counts)} episode counts for {len(settings)} settings",

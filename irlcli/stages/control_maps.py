@@ -1,4 +1,4 @@
-"""The exact positive control of IRL: MaxEnt on maps with a cue that turns, all methods side by side."""
+"""The exact positive control of IRL: MaxEnt on maps with a cue that reverses, all methods side by side."""
 
 from __future__ import annotations
 

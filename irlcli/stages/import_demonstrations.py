@@ -62,7 +62,7 @@ def request(
         )
     if len(sources) not in (1, len(settings)):
         raise UsageError(
-            f"{len(sources)} sources for {len(settings)} settings",
+            f"the number of sources is {len(sources)}, that of settings {len(settings)}",
             "give one source that names the setting of each episode, or one source per setting",
         )
     if len(sources) > 1 and setting_column is not None:

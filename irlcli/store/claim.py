@@ -55,7 +55,7 @@ def claimed(
     on_wait: Callable[[str], None] | None,
     what: str,
 ) -> Iterator[None]:
-    """Hold the claim ``path``, to be entered under the lock of this machine, if there is one.
+    """Hold the claim ``path``. Call this while holding the lock of this machine, if it has locks.
 
     Without effect where the file cannot be written, for example on a full disk.
 

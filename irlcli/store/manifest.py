@@ -40,7 +40,7 @@ class KeyRecord(NamedTuple):
 
     @property
     def key(self) -> str:
-        """sha256 of the record, 64 hexadecimal digits (design: Store, 1)."""
+        """sha256 of the record, 64 hexadecimal digits."""
         return digest(self.as_json())
 
     def as_json(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class Manifest(NamedTuple):
 
     @property
     def id(self) -> str:
-        """sha256 of key record and outputs (design: Store, 2)."""
+        """sha256 of key record and outputs."""
         return digest({"record": self.record.as_json(), "outputs": _as_json(self.outputs)})
 
     def encode(self) -> bytes:

@@ -50,7 +50,7 @@ def publish(
 def place_and_claim(
     layout: Layout, output: Path, manifest: Manifest, provenance: bytes
 ) -> Published:
-    """Publish ``output``, whose files are those of ``manifest`` (design: Store, 5).
+    """Publish ``output``, whose files are those of ``manifest``.
 
     The files are made durable and read-only, the manifest is written last, the directory is
     renamed to its id, and the key is claimed by a hard link.

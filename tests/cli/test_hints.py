@@ -44,7 +44,7 @@ def test_a_wrong_value_names_the_forms_and_the_listed_values(irl, smoke_store, c
     done = irl(*command.split(), "--ood", text, *SMOKE, "--store", smoke_store.path)
     assert done.code == 2 and text in done.err
     hint = done.err.splitlines()[-1]
-    assert "1.5x" in hint and ("2x" in hint or "0.05 to 20" in hint)
+    assert "1.5x" in hint and ("2x" in hint or "0.05 and 20" in hint)
     assert ("'engine-power'" in hint) == (text == "engine-powr")
 
 

@@ -1,4 +1,4 @@
-"""What a job of a cluster does: run the command that makes one step, and ask for another turn.
+"""What a job of a cluster does: run the command that makes one step, and ask to be requeued if stopped.
 
 This module is loaded on the nodes. It writes what became of the step beside the job's logs, because
 Slurm forgets a job within minutes where it has no database.
@@ -32,7 +32,7 @@ class StepJob(NamedTuple):
         command: its command line.
         directory: working directory of the command.
         notes: directory for what became of the step.
-        requeues: how often the job may ask for another turn.
+        requeues: how often the job may be requeued.
     """
 
     name: str
@@ -45,7 +45,7 @@ class StepJob(NamedTuple):
         """Run the command.
 
         Raises:
-            StepFailed: it failed, or was interrupted once too often.
+            StepFailed: it failed, or was interrupted more often than ``requeues``.
             SystemExit: the job was put back into the queue, or is being cancelled.
         """
         note = Path(self.notes) / f"{self.name}.failed"
@@ -55,7 +55,7 @@ class StepJob(NamedTuple):
             return
         if code in _ANOTHER_TURN:
             if not _is_running(received):
-                # After scancel nobody wants another turn; after a preemption Slurm gives one.
+                # After scancel nobody wants the job requeued; after a preemption Slurm requeues it.
                 sys.exit(Interrupted.exit_code)
             turns = self._turns()
             if turns < self.requeues:
@@ -112,7 +112,7 @@ class StepJob(NamedTuple):
 
 
 def _is_running(received: Sequence[int]) -> bool:
-    """Whether the job may go on: nobody has cancelled it.
+    """Whether the job may continue: nobody has cancelled it.
 
     To cancel, Slurm sends the same SIGTERM as before a preemption. submitit's local executor
     cancels by SIGTERM, and sends SIGUSR2 before a time limit.

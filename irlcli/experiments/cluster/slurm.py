@@ -109,7 +109,7 @@ class Slurm:
         except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError) as e:
             raise StageFailed(
                 f"Slurm refused {len(jobs)} jobs: {_reason(str(e))}",
-                "what was submitted before goes on; run the same command again to add the rest",
+                "what was submitted before continues; run the same command again to add the rest",
             ) from None
         return [job.job_id for job in submitted]
 

@@ -38,7 +38,7 @@ class JobCommand(NamedTuple):
     Attributes:
         words: the command line that makes the step of that name.
         directory: its working directory.
-        requeues: how often it may ask for another turn.
+        requeues: how often it may be requeued.
         at_a_time: jobs, where the queue itself sets no limit.
     """
 
@@ -116,7 +116,7 @@ class Submission:
     def watch(self) -> Outcome:
         """Wait until every job has ended, or a signal asks to stop.
 
-        The jobs of Slurm go on after a signal. Those of this machine stop at a checkpoint, and a
+        The jobs of Slurm continue after a signal. Those of this machine stop at a checkpoint, and a
         second signal ends the wait for that.
 
         Raises:
