@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from irlcli.stages.base import Request
 
 
-# The sections of a config that a stage and its command read. Challengers learn as retrained policies
-# do, clones have the student's network, and a collected expert is compared with the bar. What other
-# stages read is not checked: a bank, say, is looked for under the whole config.
+# The parts of a config that a stage and its command read. Challengers learn with the PPO of retrained
+# policies, clones have the student's network, and a collected expert is compared with the bar. What
+# other stages read is not checked: a bank, say, is looked for under the whole config.
 _SECTIONS = {
     "train-expert": {"expert"},
     "collect-experts": {"demonstrations", "expert", "gridworld"},
-    "train-airl": {"airl", "transfer"},
-    "choose-penalty": {"airl", "transfer", "evaluation"},
+    "train-airl": {"airl", "transfer.ppo"},
+    "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
     "clone": {"airl", "clone"},
     "train-maxent": {"maxent"},
     "transfer": {"transfer"},
@@ -170,7 +170,7 @@ class StageSession(base.StageSession):
         return artefacts
 
     def _warn_of_unread(self, requests: Sequence["Request"]) -> None:
-        """Warn of each ``--set`` that ``requests`` and what they need do not use."""
+        """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold."""
         if not self.overrides:
             return
         from irlcli.requests.overrides import behind, replaced
@@ -183,7 +183,7 @@ class StageSession(base.StageSession):
             return
         read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
         for item in self.overrides:
-            if item.partition(".")[0].strip() not in read:
+            if not any(item.strip().startswith(f"{part}.") for part in read):
                 self.console.warn(f"no stage of this command reads --set {item}")
 
     def prepare(self, request: "Request", then: str) -> Artefact | None:

@@ -224,6 +224,7 @@ POWER = "--env lunar-lander --intervention engine-power=1x"
         (f"collect-experts {POWER}", "transfer.ceiling=0.5", True),
         (f"collect-experts {POWER}", "expert.total_steps=9999", False),
         ("train-airl --demos demos --method irm", "transfer.ppo.gamma=0.9", False),
+        ("train-airl --demos demos --method irm", "transfer.ceiling=0.5", True),
         ("train-airl --demos demos --method irm", "expert.total_steps=9999", True),
         ("assess airl", "expert.total_steps=9999", False),
     ],
