@@ -55,8 +55,8 @@ def test_a_wrong_value_names_the_forms_and_the_listed_values(irl, smoke_store, c
         ("transfer.ceiling=high", "a quantile from 0 to 1, or none"),
         ("airl.replay_share=2", "a number from 0 to 1, for example 0.5"),
         ("airl.ppo.n_envs=5000", "a number from 1 to 1024, for example 16"),
-        ("airl.plateau_rounds=0", "write a whole number from 1, or omit it"),
-        ("airl.columns=first", "write a value, or omit it"),
+        ("airl.plateau_rounds=0", "write a whole number from 1, or none"),
+        ("airl.columns=first", "write a value, or none"),
     ],
 )
 def test_a_bounded_field_names_its_bounds(irl, smoke_store, item, hint):
