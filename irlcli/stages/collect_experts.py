@@ -80,7 +80,9 @@ def request(
     if len(counts) == 1:
         counts *= len(settings)
     if min(counts) < 1:
-        raise UsageError("the number of episodes must be at least 1", f"it is {min(counts)}")
+        raise UsageError(
+            f"--episodes {min(counts)}: a setting needs at least one episode", "record at least 1"
+        )
     if len(counts) != len(settings):
         raise UsageError(
             f"{len(counts)} episode counts for {len(settings)} settings",

@@ -187,7 +187,11 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
         ([tmp_path / "none.parquet", *LANDER], 2, "no episode"),
         ([tmp_path / "nowhere.parquet", *LANDER], 3, "nowhere.parquet"),
         ([tmp_path / "empty", *LANDER[:2], "--setting", "default"], 2, "empty"),
-        ([exported, exported, exported, *LANDER], 2, "3 sources for 2 settings"),
+        (
+            [exported, exported, exported, *LANDER],
+            2,
+            "the number of sources is 3, that of settings 2",
+        ),
         (["minari:me", *LANDER], 2, "'me'"),
         (["minari:m/e-v0", *LANDER], 2, "'m/e-v0'"),
         (["minari:me/nothing-v0", *LANDER], 3, "nothing-v0"),

@@ -261,7 +261,7 @@ def test_running_out_of_memory_says_nothing_about_a_file(irl, store_copy, tmp_pa
     )
     assert result.code == 1
     assert "error: out of memory" in result.err and "hint: " in result.err
-    assert "defect" not in result.err and "not a tensor file" not in result.err
+    assert "defect" not in result.err and "not a file of a reward" not in result.err
 
 
 def test_changes_anywhere_in_the_package_are_recorded(tmp_path, monkeypatch):
