@@ -68,9 +68,16 @@ def test_the_report_rates_the_reward(irl, made, tables, tmp_path):
     assert [(q["setting"], q["agent"], q["seed"]) for q in found] == [
         (f"engine-power={value}", "erm", 0) for value in SETTINGS
     ]
-    assert [len(q["verdicts"]) for q in found] == [0, 0, 1]
     artefact = Store(made).resolve(f"{ROW}.erm.0.assess").artefact
     written = json.loads((artefact.directory / "assessment.json").read_text())
+    unseen = {
+        e["kind"]: e["true"]["mean"]
+        for e in written["bank"]
+        if e["setting"] == found[-1]["setting"]
+    }
+    # An expert of the smoke profile may earn no more than the random agent. Verdicts then mean nothing.
+    verdicts = int(unseen["expert"] > unseen["random"])
+    assert [len(q["verdicts"]) for q in found] == [0, 0, verdicts]
     for q, s in zip(found, written["settings"], strict=True):
         assert q["spearman"] == s["overall"]["spearman"]["value"]
         assert q["expert_minus_idle"] == s["expert_minus_idle"]["mean"]
@@ -79,7 +86,8 @@ def test_the_report_rates_the_reward(irl, made, tables, tmp_path):
     text = (tmp_path / "out" / "README.md").read_text()
     assert "## Reward quality" in text and "(bank-lunar-lander-engine-power.png)" in text
     page = (tmp_path / "out" / "tiny.html").read_text()
-    assert "Learned against true return" in page and "1/1" in text
+    assert "Learned against true return" in page
+    assert ("Weak expert" in text) == (not verdicts) and ("1/1" in text or not verdicts)
 
 
 def test_reports_and_assessments_score_by_the_same_reward(irl, made, tables):
