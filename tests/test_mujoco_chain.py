@@ -101,7 +101,7 @@ def test_a_missing_library_is_one_line_with_the_command_that_installs_it(
     assert done.code == 1 and done.out == ""
     error, hint = done.err.splitlines()[-2:]
     assert error.endswith(f": {robot} needs MuJoCo, which is not installed")
-    assert hint == "hint: pip install '.[mujoco]' in irlcli's checkout"
+    assert hint == "hint: in irlcli's checkout: pip install '.[mujoco]'"
 
 
 def test_a_broken_library_is_one_line_too(tmp_path, irl, monkeypatch):

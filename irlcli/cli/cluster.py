@@ -102,7 +102,7 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     if importlib.util.find_spec("submitit") is None:
         raise UsageError(
             "--cluster needs the package submitit, which is not installed",
-            f"{sys.executable} -m pip install '.[slurm]' in irlcli's checkout",
+            f"in irlcli's checkout: {sys.executable} -m pip install '.[slurm]'",
         )
     minutes = parse_minutes(options.time or DEFAULT_TIME)
     # A job of few minutes is warned when half of them are over.

@@ -258,7 +258,7 @@ def _parse_toml(text: str) -> dict[str, Any]:
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with the values of ``over``; a field that is unset in ``over`` is in neither."""
+    """``base`` with the values of ``over``; a field that ``over`` unsets is left out."""
     merged = dict(base)
     for name, value in over.items():
         if isinstance(value, Mapping):

@@ -122,7 +122,7 @@ def write_mp4(path: Path, played: Film) -> None:
     except ImportError:
         raise StageFailed(
             "MP4 needs imageio-ffmpeg",
-            "pip install '.[video]' in irlcli's checkout, or write a .gif",
+            "in irlcli's checkout: pip install '.[video]', or write a .gif",
         ) from None
     writer = write_frames(str(path), played.size, fps=1.0 / played.seconds, quality=8)
     with closing(writer):

@@ -31,9 +31,9 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
         return
     parameters = [request.parameters for request in requests]
     for item, (field, value) in zip(overrides, overridden(overrides).items(), strict=True):
-        held = {_held(field, each) for each in parameters} - {None}
         if field.startswith(_ELSEWHERE):
             continue
+        held = {_held(field, each) for each in parameters} - {None}
         if held and _shown(field, value) not in held:
             values = " or ".join(sorted(text for text in held if text))
             yield f"--set {item} is not used: with the other values it is {values}"

@@ -15,7 +15,7 @@ def explained(error: Exception, url: str) -> IrlError:
             "name a directory, or a URL such as s3://BUCKET/PATH",
         )
     if isinstance(error, ImportError):
-        extra = "pip install '.[s3]' in irlcli's checkout" if protocol in ("s3", "s3a") else text
+        extra = "in irlcli's checkout: pip install '.[s3]'" if protocol in ("s3", "s3a") else text
         return UsageError(f"{url}: the package for {protocol!r} is not installed", extra)
     if kinds & {"NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError"}:
         return UsageError(

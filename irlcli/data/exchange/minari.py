@@ -268,7 +268,7 @@ def _storage_class() -> Any:
     except ImportError as error:
         raise StageFailed(
             f"{error.name or 'Minari'} is not installed",
-            "pip install '.[minari]' in irlcli's checkout",
+            "in irlcli's checkout: pip install '.[minari]'",
         ) from None
     return MinariStorage
 

@@ -6,7 +6,7 @@ with other masses, joint limits, actuators and friction.
 
 from irlcli.envs.spec import EnvironmentSpec, Knob, Needs
 
-MUJOCO = Needs("mujoco", "MuJoCo", "pip install '.[mujoco]' in irlcli's checkout")
+MUJOCO = Needs("mujoco", "MuJoCo", "in irlcli's checkout: pip install '.[mujoco]'")
 
 
 def _knobs(legs: str) -> dict[str, Knob]:
