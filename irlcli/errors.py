@@ -84,14 +84,14 @@ def importing(what: str, module: str) -> Iterator[None]:
     """Import ``module``, which ``what`` is registered with.
 
     Raises:
-        StageFailed: it, or what it imports, is not installed.
+        StageFailed: it or what it imports is not installed, or it has no such name.
     """
     try:
         yield
-    except ModuleNotFoundError as error:
+    except (ModuleNotFoundError, AttributeError) as error:
         raise StageFailed(
             f"{what}: {module} cannot be imported ({error})",
-            "install its package, or name its folder in PYTHONPATH",
+            "install its package, or name its folder in PYTHONPATH; or correct the registered name",
         ) from error
 
 

@@ -76,6 +76,21 @@ def test_a_penalty(irl, lab, store_copy, monkeypatch):
     assert min(values) >= 0.0 and max(values) > 0.0
 
 
+@pytest.mark.parametrize("place", ["nowhere.fairl:FAIRL", "irlcli.learners.gail:GALE"])
+def test_what_is_registered_with_a_wrong_place(irl, store_copy, monkeypatch, place):
+    monkeypatch.setitem(learners.LEARNERS, "fairl", learners.Learner(place))
+    monkeypatch.setitem(rl.ALGORITHMS, "other", place)
+    common = ["--store", store_copy.path, "--profile", "smoke"]
+    learned = ["train-airl", "--demos", "demos", "--set", "airl.learner=fairl"]
+    for line in (
+        learned,
+        ["transfer", "--reward", "airl", "--ood", "1.5x", "--algorithm", "other"],
+    ):
+        done = irl(*line, *common)
+        assert done.code == 1 and f"{place} cannot be imported" in done.err
+        assert "PYTHONPATH" in done.err and "defect" not in done.err
+
+
 def test_a_penalty_whose_module_is_missing(irl, store_copy, monkeypatch):
     entry = penalties.Penalty("nowhere.risk_range", ("airl",), compares=True, reads=())
     monkeypatch.setitem(penalties.PENALTIES, "risk-range", entry)

@@ -26,7 +26,7 @@ _SECTIONS = {
     "collect-experts": {"demonstrations", "expert", "gridworld"},
     "train-airl": {"airl", "transfer.ppo"},
     "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
-    "clone": {"airl", "clone"},
+    "clone": {"airl.ppo", "airl.actions", "clone"},
     "train-maxent": {"maxent"},
     "transfer": {"transfer"},
     "evaluate": {"evaluation"},
@@ -183,7 +183,8 @@ class StageSession(base.StageSession):
             return
         read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
         for item in self.overrides:
-            if not any(item.strip().startswith(f"{part}.") for part in read):
+            field = item.partition("=")[0].strip()
+            if not any(f"{field}.".startswith(f"{part}.") for part in read):
                 self.console.warn(f"no stage of this command reads --set {item}")
 
     def prepare(self, request: "Request", then: str) -> Artefact | None:

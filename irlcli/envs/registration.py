@@ -87,7 +87,8 @@ def build(
         # Environments that were added since this module was imported.
         register()
         with importing(f"environment {spec.name!r}", spec.entry_point):
-            return gymnasium.make(spec.gym_id, **arguments).unwrapped
+            resolve_name(spec.entry_point)
+        return gymnasium.make(spec.gym_id, **arguments).unwrapped
     world = Adapted(_own(spec, spec.own, arguments, f"{spec.name} {setting}"), spec.name)
     discrete = not isinstance(world.action_space, gymnasium.spaces.Box)
     if discrete != spec.discrete_actions:

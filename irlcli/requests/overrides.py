@@ -9,8 +9,8 @@ from irlcli.configs.load import overridden
 from irlcli.configs.schema import UNSET_MEANS
 from irlcli.stages.base import From, Request
 
-# Requests hold these values under the fields that they replace.
-_ELSEWHERE = "transfer.from_student."
+# A policy that begins as the student holds these values under the fields that they replace.
+_OF_STUDENTS = "transfer.from_student."
 
 
 def behind(request: Request) -> Iterator[Request]:
@@ -29,9 +29,13 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
     """
     if not overrides:
         return
-    parameters = [request.parameters for request in requests]
+    made = list(requests)
+    parameters = [request.parameters for request in made]
     for item, (field, value) in zip(overrides, overridden(overrides).items(), strict=True):
-        if field.startswith(_ELSEWHERE):
+        if field.startswith(_OF_STUDENTS):
+            retrained = [request for request in made if request.stage.name == "transfer"]
+            if retrained and not any("start" in request.inputs for request in retrained):
+                yield f"--set {item} is not used: no policy begins as the student"
             continue
         held = {_held(field, each) for each in parameters} - {None}
         if held and _shown(field, value) not in held:

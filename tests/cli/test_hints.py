@@ -225,6 +225,8 @@ POWER = "--env lunar-lander --intervention engine-power=1x"
         (f"collect-experts {POWER}", "expert.total_steps=9999", False),
         ("train-airl --demos demos --method irm", "transfer.ppo.gamma=0.9", False),
         ("train-airl --demos demos --method irm", "transfer.ceiling=0.5", True),
+        ("train-airl --demos demos --method bc", "airl.gradient_penalty=3", True),
+        ("train-airl --demos demos --method bc", "airl.ppo.net_arch=[8]", False),
         ("train-airl --demos demos --method irm", "expert.total_steps=9999", True),
         ("assess airl", "expert.total_steps=9999", False),
     ],
@@ -295,6 +297,16 @@ def test_a_value_that_the_others_leave_without_effect_is_named(
     assert done.code == 0, done.err
     warned = dict(re.findall(r"--set (\S+) is not used: .* it is (\S+)", done.err))
     assert warned == unused
+
+
+@pytest.mark.parametrize("start", ["scratch", "student"])
+def test_what_only_a_policy_from_the_student_reads_is_named(irl, smoke_store, start):
+    line = ["transfer", "--reward", "airl", "--ood", "1.5x", "--start", start, "--dry-run"]
+    item = "transfer.from_student.total_steps=9999"
+    done = irl(*line, "--set", item, *SMOKE, "--store", smoke_store.path)
+    assert done.code == 0
+    warned = f"--set {item} is not used: no policy begins as the student" in done.err
+    assert warned == (start == "scratch")
 
 
 def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):
