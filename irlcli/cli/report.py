@@ -23,10 +23,9 @@ from irlcli.cli.table_report import (
     print_report,
     report_json,
     report_of,
-    run_line,
 )
 from irlcli.envs.registry import ENVIRONMENTS
-from irlcli.errors import NotFound, UsageError, suggest
+from irlcli.errors import UsageError, suggest
 from irlcli.requests.session import DEFAULT_PROFILE
 from irlcli.requests.tables import Choice, open_plan
 from irlcli.store import Artefact
@@ -136,12 +135,6 @@ def _table(session: StageSession, chosen: Choice, name: str | None, directory: P
     if directory is not None:
         check_out(directory, session.store.root)
     plan = open_plan(session, chosen)
-    missing = [task for task in plan.tasks if not plan.exists(task)]
-    if plan.figure is not None and missing and not session.dry_run:
-        raise NotFound(
-            f"{session.store.root} lacks {len(missing)} of {len(plan.tasks)} steps of {chosen.table}",
-            f"`{run_line(session, chosen)}` makes them",
-        )
     request = report_of(session, chosen, plan)
 
     def details(artefact: Artefact) -> dict[str, Any]:

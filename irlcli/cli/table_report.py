@@ -22,22 +22,30 @@ def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":
     """The report on what the store holds of a whole table.
 
     Raises:
-        NotFound: the store holds nothing of it.
+        NotFound: the store holds nothing of it, or of a figure not every step.
     """
     from irlcli.experiments import report
 
+    # A figure's request is made from the steps themselves, so running it would compute them.
+    if plan.figure is not None and not session.dry_run:
+        missing = sum(not plan.exists(name) for name in plan.tasks)
+        if missing:
+            raise NotFound(
+                f"{session.store.root} lacks {missing} of {len(plan.tasks)} steps of {choice.table}",
+                f"`{_run_line(session, choice)}` makes them",
+            )
     words = ["irl", "report", choice.table, *session.config_words(), *choice.words()]
     try:
         return report.request(plan, shlex.join(words))
     except NotFound as error:
         error.hint = (
-            f"`{run_line(session, choice)}` makes them. --profile, --set, --seeds and --methods must "
+            f"`{_run_line(session, choice)}` makes them. --profile, --set, --seeds and --methods must "
             "be those of the runs"
         )
         raise
 
 
-def run_line(session: StageSession, choice: Choice) -> str:
+def _run_line(session: StageSession, choice: Choice) -> str:
     """The command line that makes what a report on ``choice`` lacks, for a hint."""
     other = session.file or session.overrides or choice.choose_penalty is not None
     tag = ["--tag", "NAME"] if other else []

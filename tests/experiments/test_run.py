@@ -16,6 +16,8 @@ import pytest
 from test_architecture import loaded_by
 
 from irlcli.configs import load_config
+from irlcli.experiments.execute import Outcome
+from irlcli.experiments.failures import Failure
 from irlcli.experiments.runner import Runner
 from irlcli.interventions import parse_settings
 from irlcli.stages import train_expert
@@ -198,6 +200,16 @@ def test_a_failed_step_stops_only_what_depends_on_it(runs, tmp_path):
     before = len(runs.processes())
     runs.run(store, "--until", "returns")
     assert len(runs.processes()) == before + 2 and len(Store(store).names()) == 13
+
+
+def test_a_figure_of_failed_steps_is_not_drawn(irl, tmp_path, monkeypatch):
+    """Drawing it would compute them in the process of `irl run` itself."""
+    failed = {"smoke.figure2.sweep": Failure(1, "it was asked to fail", "do not ask for it")}
+    outcome = Outcome([], [], [], failed, [], False)
+    monkeypatch.setattr("irlcli.cli.experiments._make_all", lambda *_: outcome)
+    monkeypatch.setattr(Runner, "run", lambda *_: pytest.fail("a step was computed"))
+    done = irl("run", "figure2", "--profile", "smoke", "--store", tmp_path / "runs")
+    assert done.code == 1 and "steps failed: smoke.figure2.sweep" in done.err
 
 
 def test_a_damaged_artefact_is_set_aside_and_then_made_again(uninterrupted, runs, tmp_path):
