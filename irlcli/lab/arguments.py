@@ -24,7 +24,7 @@ class Configs(TypedDict, total=False):
 
     Attributes:
         profile, settings: instead of the lab's.
-        set: after the lab's.
+        set: after the lab's, which it replaces where both set a field.
     """
 
     profile: str
@@ -91,6 +91,16 @@ def overrides(given: Overrides) -> list[str]:
     if isinstance(given, Mapping):
         return [f"{field}={_toml(value)}" for field, value in given.items()]
     return listed(given)
+
+
+def merged(first: Sequence[str], later: Sequence[str]) -> list[str]:
+    """Both lists of ``FIELD=VALUE``, without those of ``first`` whose field ``later`` sets too."""
+    fields = {_field(item) for item in later}
+    return [*(item for item in first if _field(item) not in fields), *later]
+
+
+def _field(item: str) -> str:
+    return item.partition("=")[0].strip()
 
 
 def _toml(value: Any) -> str:

@@ -48,9 +48,9 @@ def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab):
     made = [
         lab.collect_experts("gridworld", "path-group", episodes=[3, 2, 1], seed=2),
         lab.evaluate(idle=True, **IDLE),
-        irlcli.Lab(lab.store, profile="smoke", set=["transfer.total_steps=1024"]).transfer(
-            "airl", "1.5x", seed=1, set={"transfer.ppo.n_epochs": 1}
-        ),
+        irlcli.Lab(
+            lab.store, profile="smoke", set=["transfer.total_steps=1024", "transfer.ppo.n_epochs=2"]
+        ).transfer("airl", "1.5x", seed=1, set={"transfer.ppo.n_epochs": 1}),
     ]
     config = made[-1].parameters["transfer"]
     assert (config["total_steps"], config["ppo"]["n_epochs"]) == (1024, 1)
@@ -84,6 +84,18 @@ def test_every_option_of_a_command_is_an_argument(command):
     general |= {"tensorboard", "dry_run", "as_json", "debug", "to"}
     arguments = set(inspect.signature(COMMANDS[command]).parameters) - {"self", "configs"}
     assert arguments == {option.name for option in found.params} - general
+
+
+def test_a_call_may_set_a_field_of_the_labs(lab):
+    steps = lab.artefact("airl").parameters["airl"]["total_steps"]
+    other = irlcli.Lab(lab.store, profile="smoke", set={"airl.total_steps": 2 * steps})
+    table = {"table": "table1", "seeds": 0, "methods": "irm", "rows": "lunar-lander.engine-power"}
+
+    def status(**configs):
+        found = {step["name"]: step["status"] for step in other.plan(**table, **configs).steps}
+        return found["smoke.lunar-lander.engine-power.irm.0"]
+
+    assert (status(), status(set={"airl.total_steps": steps})) == ("RUN", "HIT")
 
 
 def test_tables_are_data_frames(lab, irl, store_copy):
