@@ -74,12 +74,19 @@ def assess(
     )
     retrain = None
     if not any(policies.retrained.values()):
-        own = environment(origin.env).own
-        named = () if own is None else ("--env", own.source)
+        # A built-in environment is known from the reward, and so is one that its artefact describes.
+        file = _file(origin.env)
+        named = () if file is None else ("--env", file)
         retrain = session.suggestion(
             "transfer", "--reward", reward, *named, "--setting", str(settings[0])
         )
     return Assessing(request, retrain)
+
+
+def _file(env: str) -> str | None:
+    """The TOML file that describes ``env``; None for a built-in one, or one that an artefact describes."""
+    own = environment(env).own
+    return None if own is None or own.directory is None else own.source
 
 
 def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[str, ...]]":
@@ -95,8 +102,7 @@ def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[
 def _warn_of_missing_experts(
     session: StageSession, env: str, settings: Sequence[Setting], policies: bank.Policies
 ) -> None:
-    own = environment(env).own
-    named = env if own is None else own.source
+    named = env if environment(env).own is None else _file(env) or "FILE.toml"
     for setting in map(str, settings):
         if setting not in policies.experts:
             line = session.suggestion("evaluate", "--expert", "--env", named, "--setting", setting)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -52,6 +54,13 @@ def test_the_chain_needs_the_file_only_once(bench):
     record = Store("runs").resolve("moved").artefact.manifest.record
     assert record.parameters["transfer"]["total_steps"] == 800
     assert record.parameters["environment"]["own"]["knobs"] == {"mass": "mass_scale"}
+    # A hint names a file only where there is one, so it can be run as it is.
+    assessed = bench.irl("assess", "irm", "--ood", "mass=2x", *SMOKE)
+    (retrain,) = re.findall("`irl (transfer .*?)`", assessed.err)
+    assert status(bench, *shlex.split(retrain)) == "RUN"
+    assert "evaluate --expert --env FILE.toml --setting mass=2x" in assessed.err
+    with_file = bench.irl("assess", "irm", "--ood", "mass=2x", "--env", "cart.toml", *SMOKE)
+    assert with_file.err.count("--env cart.toml") == 2
     # Elsewhere the module is missing, and the file brings it back.
     again = ("transfer", "--reward", "irm", "--ood", "mass=4x", *SMOKE)
     assert status(bench, *again) == "HIT"
