@@ -5,6 +5,7 @@ The header of a checkpoint carries the attempts from one process to the next.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -199,7 +200,16 @@ def git_state(package: Path) -> dict[str, str | None]:
     if changes is None or new is None:
         return unknown
     for name in sorted(filter(None, new.split(b"\0"))):
-        content = hashlib.sha256((package / os.fsdecode(name)).read_bytes()).hexdigest()
+        content = hashlib.sha256(_content(package / os.fsdecode(name))).hexdigest()
         changes += b"new file " + name + b" " + content.encode() + b"\n"
     dirty = hashlib.sha256(changes).hexdigest()[:16] if changes else None
     return {"commit": commit.decode().strip(), "dirty": dirty}
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a file, the target of a link that leads to none; empty for what cannot be read."""
+    # An editor's lock is a link to nothing, and a file may vanish after git listed it.
+    for read in (path.read_bytes, lambda: os.fsencode(os.readlink(path))):
+        with contextlib.suppress(OSError):
+            return read()
+    return b""

@@ -184,7 +184,10 @@ def test_code_that_is_not_committed_counts_new_files_too(tmp_path):
     for name, text in (("new.py", "1"), ("new.py", "2"), ("other.py", "2"), ("__init__.py", "3")):
         (package / name).write_text(text)
         states.append(provenance.git_state(package)["dirty"])
-    assert None not in states and len(set(states)) == 4
+    # Emacs' lock of a changed file.
+    (package / ".#new.py").symlink_to("user@host.123:456")
+    states.append(provenance.git_state(package)["dirty"])
+    assert None not in states and len(set(states)) == 5
 
 
 class LongTraining:
