@@ -93,7 +93,8 @@ def _members(place: str, config: Config, policies: Policies) -> Iterator[_Member
     if policies.student is not None:
         yield _Member("student", "student", policies.student)
     for trained, expert in policies.reused.items():
-        if trained != place:
+        # Where one expert demonstrates everywhere, it is nothing beside the setting's own.
+        if trained != place and expert != policies.experts.get(place):
             yield _Member(f"expert of {trained}", "reused", expert)
     if place in policies.experts:
         yield _Member(f"expert of {place}", "expert", policies.experts[place])
@@ -178,7 +179,12 @@ class Finder:
             if expert is not None:
                 return expert
         request = train_expert.demonstrator(env, parse_setting(env, text), self._config)
-        return From(request, "policy.pt") if self._lookup(request).artefact is not None else None
+        step = self._lookup(request)
+        if step.artefact is None:
+            return None
+        # A HIT is equal to the same expert behind the demonstrations.
+        hit = step.status == "HIT"
+        return source_in(step.artefact, "policy.pt") if hit else From(request, "policy.pt")
 
     def _student(self, reward: Source, origin: Reward) -> Source | None:
         maker = self._maker(reward)

@@ -361,11 +361,7 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Retrained]]) -
     policies = Policies(
         clone=From(imitation, "policy.pt"),
         student=From(reward.learned, "policy.pt"),
-        reused={
-            str(e): experts[str(e)]
-            for e in trained
-            if requests.expert(e) != requests.expert(unseen[0])
-        },
+        reused={str(e): experts[str(e)] for e in trained},
         experts=experts,
         retrained=retrained,
     )

@@ -5,8 +5,12 @@ from dataclasses import replace
 
 import pytest
 
+from irlcli.configs import load_config
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs.cue import with_hints
+from irlcli.experiments.bank import Finder, bank
+from irlcli.experiments.references import tensor_file
+from irlcli.experiments.status import Lookup
 from irlcli.interventions import cue_in, parse_setting
 from irlcli.store import Store
 
@@ -94,6 +98,28 @@ def test_a_table_may_have_a_lambda_for_a_method(made, tables, irl, tmp_path):
     line = ["report", "control", "--experiments", tables, "--profile", "smoke", "--store", made]
     assert irl(*line, "--out", tmp_path / "out").code == 0
     assert "irm: 7" in (tmp_path / "out" / "README.md").read_text()
+
+
+def test_a_bank_has_one_expert_in_each_setting(made):
+    """Whether it is the one behind the demonstrations, or found by the config as in 0.5."""
+    store, config = Store(made), load_config("lunar-lander", "smoke")
+    reward, origin = tensor_file(store, f"{ROW}.irm.0", "reward")
+    texts = [f"cue-strength={value}" for value in ("0.95", "0.8", "0.5")]
+    settings = [parse_setting("lunar-lander", text) for text in texts]
+    policies = Finder(store, Lookup(store), config).policies(reward, origin, settings, None, ())
+    entries = bank("lunar-lander", settings, config, policies)
+    experts = [(e.kind, e.setting) for e in entries if e.kind in ("expert", "reused")]
+    assert experts == [("expert", text) for text in texts]
+
+
+def test_a_bank_of_a_table_has_one_expert_in_each_setting(irl, tmp_path):
+    path = tmp_path / "tables.toml"
+    path.write_text(TABLES.replace('"cue"]', '"cue", "assess"]'))
+    line = ["plan", "control", "--experiments", path, "--profile", "smoke", "--json"]
+    planned = irl(*line, "--store", tmp_path / "runs")
+    names = [step["name"] for step in json.loads(planned.out)["steps"]]
+    experts = [name for name in names if "bank.expert" in name]
+    assert experts == [f"{ROW}.bank.expert-of-{v}.{v}" for v in ("0.95", "0.8", "0.1")]
 
 
 def test_a_second_run_finds_everything(made, tables, irl):
