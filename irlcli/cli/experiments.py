@@ -345,7 +345,7 @@ def _report(
         copy_outputs(session, artefact, directory)
     session.print_artefact(artefact, name)
     if not session.as_json:
-        print_report(session, artefact, choice.table)
+        print_report(session, artefact)
 
 
 def _raise_for(outcome: "Outcome", found: "Plan", continue_hint: str) -> None:

@@ -138,14 +138,14 @@ def _table(session: StageSession, chosen: Choice, name: str | None, directory: P
     request = report_of(session, chosen, plan)
 
     def details(artefact: Artefact) -> dict[str, Any]:
-        text = report_json(session, artefact, chosen.table)
+        text = report_json(session, artefact)
         return {} if text is None else {"report": text}
 
     for artefact in session.deliver([request], name, details):
         if directory is not None:
             copy_outputs(session, artefact, directory)
         if not session.as_json:
-            print_report(session, artefact, chosen.table)
+            print_report(session, artefact)
 
 
 def _table2(session: StageSession, form: str | None) -> None:

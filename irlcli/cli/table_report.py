@@ -88,10 +88,10 @@ def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> 
         ) from None
 
 
-def print_report(session: StageSession, artefact: Artefact, kind: str) -> None:
+def print_report(session: StageSession, artefact: Artefact) -> None:
     """The tables and caveats of a report on stderr."""
     _warn_of_versions(session, artefact)
-    report = report_json(session, artefact, kind)
+    report = report_json(session, artefact)
     if report is None:
         out.print_note(session.store.open(artefact, "README.md").read_text().rstrip())
         return
@@ -118,9 +118,8 @@ def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:
             )
 
 
-def report_json(session: StageSession, artefact: Artefact, kind: str) -> Any | None:
+def report_json(session: StageSession, artefact: Artefact) -> Any | None:
     """The tables of a report as JSON; None if it has none."""
-    name = f"{kind}.json"
-    if name not in [output.path for output in artefact.manifest.outputs]:
-        return None
-    return read_json(session.store.open(artefact, name))
+    # A comparison's file has the name of its table, that of experts does not.
+    names = [output.path for output in artefact.manifest.outputs if output.path.endswith(".json")]
+    return read_json(session.store.open(artefact, names[0])) if names else None

@@ -444,6 +444,17 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
     assert low.startswith("Below their bar") and "engine-power=1.5x" in low
 
 
+def test_a_table_of_experts_may_have_another_name(irl, table_store, tmp_path):
+    tables = tmp_path / "tables.toml"
+    tables.write_text('[mine]\ntitle = "My experts"\nkind = "experts"\n')
+    line = ["report", "mine", "--experiments", tables, *ROW, "--store", table_store]
+    line += ["--profile", "smoke", *SMALL]
+    done = irl(*line)
+    assert done.code == 0 and re.search(r"^lunar-lander +engine-power=1.5x ", done.err, re.M)
+    document = json.loads(irl(*line, "--json").out)
+    assert document["report"]["caveats"] == caveats(done)
+
+
 def test_no_experts(irl, tmp_path):
     empty = irl("report", "experts", *ROW, "--store", tmp_path / "runs")
     assert empty.code == 3 and "irl run experts" in empty.err
