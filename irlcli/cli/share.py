@@ -1,6 +1,7 @@
 """``irl push`` and ``irl pull``: artefacts from one store to another."""
 
 import shlex
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -38,7 +39,7 @@ def push(
 
     session.check_exists()
     place = open_place(_given(to, "--to"), session.console.warn)
-    artefacts = _chosen(session.store, refs, everything)
+    artefacts = _chosen(session.store, session.artefact, refs, everything)
     _share(session, session.store, place, artefacts, f"push to {place.root}", quiet)
 
 
@@ -57,8 +58,15 @@ def pull(
     from irlcli.store.sources import open_sources
 
     (place,) = open_sources([_given(source, "--from")], session.console.warn)
+
+    def there(ref: str) -> Artefact:
+        artefact = place.resolve(ref).artefact
+        if artefact is None:
+            raise NotFound(f"{ref!r} is not an artefact")
+        return artefact
+
     try:
-        artefacts = _chosen(place, refs, everything)
+        artefacts = _chosen(place, there, refs, everything)
     except NotFound as error:
         listing = shlex.join(["irl", "ls", "--from", str(place.root)])
         raise NotFound(
@@ -80,19 +88,17 @@ def _given(place: str, option: str) -> str:
     return place
 
 
-def _chosen(store: "Place", refs: list[str] | None, everything: bool) -> list[Artefact]:
-    """The artefacts of ``store`` that a command line names, each once."""
-    if everything == bool(refs):
-        raise UsageError("name artefacts, or give --all", "either REF... or --all")
+def _chosen(
+    store: "Place", find: Callable[[str], Artefact], refs: list[str] | None, everything: bool
+) -> list[Artefact]:
+    """The artefacts of ``store`` that a command line names, each once; ``find`` looks one up."""
+    if refs and everything:
+        raise UsageError("REF and --all are both given", "give one of them")
     if everything:
         return list(store.index().artefacts.values())
-    found = {}
-    for ref in refs or ():
-        artefact = store.resolve(ref).artefact
-        if artefact is None:
-            raise NotFound(f"{ref!r} is not an artefact of the store {store.root}")
-        found[artefact.id] = artefact
-    return list(found.values())
+    if not refs:
+        raise UsageError("name artefacts, or give --all", "either REF... or --all")
+    return list({artefact.id: artefact for artefact in map(find, refs)}.values())
 
 
 def _share(

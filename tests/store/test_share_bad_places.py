@@ -223,3 +223,26 @@ def test_an_unknown_reference_names_the_place(irl, store, chain, url, tmp_path):
     push(store, url, chain["airl"])
     result = irl("pull", "imr-0", "--from", url, "--store", tmp_path / "new")
     assert result.code == 3 and url in result.err and f"irl ls --from {url}" in result.err
+
+
+# What the command line names
+
+
+def test_a_file_is_no_artefact_to_push_or_pull(irl, store, chain, tmp_path):
+    file, there = tmp_path / "README.md", tmp_path / "there"
+    file.touch()
+    pushed = irl("push", file, "--to", there, "--store", store.root)
+    assert pushed.code == 3 and "is a file, not an artefact of the store" in pushed.err
+    assert "irl ls" in pushed.err.partition("hint: ")[2]
+    push(store, str(there), chain["airl"])
+    pulled = irl("pull", file, "--from", there, "--store", tmp_path / "other")
+    assert pulled.code == 3 and f"irl ls --from {there}" in pulled.err.partition("hint: ")[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(("irm-0", "--all"), "REF and --all are both given"), ((), "name artefacts, or give --all")],
+)
+def test_either_artefacts_or_all_are_named(irl, store, chain, tmp_path, words, message):
+    done = irl("push", *words, "--to", tmp_path / "there", "--store", store.root)
+    assert done.code == 2 and message in done.err and "hint: " in done.err
