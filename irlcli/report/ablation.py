@@ -6,15 +6,14 @@ Points are those of :mod:`irlcli.report.compute`; the variants stand where metho
 from __future__ import annotations
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from irlcli.report.agents import title
 from irlcli.report.compute import whole_seeds
+from irlcli.report.drawing import panels
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.statistics import holm, paired_p, summarise
 from irlcli.report.tables import Table
@@ -185,10 +184,10 @@ def without_effect(p: Parameters) -> list[str]:
     return result
 
 
-def figure(p: Parameters, found: pd.DataFrame) -> plt.Figure:
+def figure(p: Parameters, found: pd.DataFrame) -> Figure:
     """A panel per row: each seed's retrained policies and student, by variant, and the gates."""
     size = (0.8 + max(4.0, 0.9 * len(p.variants)) * len(p.rows), 3.8)
-    drawn, axes = plt.subplots(1, len(p.rows), figsize=size, squeeze=False, layout="constrained")
+    drawn, axes = panels(1, len(p.rows), size)
     for axis, row in zip(axes[0], p.rows, strict=True):
         _panel(axis, p, row, found)
     axes[0, 0].set_ylabel("true return, % of the setting's expert")
@@ -197,8 +196,8 @@ def figure(p: Parameters, found: pd.DataFrame) -> plt.Figure:
     return drawn
 
 
-def _panel(axis: plt.Axes, p: Parameters, row: Row, found: pd.DataFrame) -> None:
-    ink = plt.rcParams["text.color"]
+def _panel(axis: Axes, p: Parameters, row: Row, found: pd.DataFrame) -> None:
+    ink = matplotlib.rcParams["text.color"]
     for gate, line in zip(GATES, ("--", ":"), strict=True):
         axis.axhline(100 * gate, color=ink, lw=0.9, ls=line, alpha=0.7, label=f"{gate:.0%}")
     retrained = {"color": _COLOUR, "mew": 0}

@@ -6,13 +6,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import pandas as pd
 
 from irlcli.configs import ControlConfig
+from irlcli.report.drawing import panels, save
 from irlcli.report.statistics import bootstrap_interval
 from irlcli.report.tables import markdown_table
 
@@ -219,8 +216,8 @@ def _chosen(cells: _Cells, chosen: pd.DataFrame, strengths: Sequence[Sequence[fl
 
 def draw(directory: Path, summarised: pd.DataFrame) -> None:
     """Write ``control.png`` and ``control.pdf``: against lambda, settings and gap."""
-    with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
-        figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
+    with matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
+        figure, axes = panels(2, 2, (11, 8))
         for axis, measure, title in (
             (axes[0, 0], "pays_colour", "weight of the colour in the reward (learned features)"),
             (axes[0, 1], "quality", "quality visited in the unseen setting (learned features)"),
@@ -245,9 +242,7 @@ def draw(directory: Path, summarised: pd.DataFrame) -> None:
             axis.axhline(0.5, color="0.7", lw=0.8, zorder=0)
         for axis in axes.flat:
             axis.legend(fontsize=7, framealpha=0.6, loc="best")
-        figure.savefig(directory / "control.png", dpi=130)
-        figure.savefig(directory / "control.pdf", metadata={"CreationDate": None})
-        plt.close(figure)
+        save(figure, directory, "control")
 
 
 def _cases(summarised: pd.DataFrame, prefix: str) -> list[str]:

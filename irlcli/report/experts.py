@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import pandas as pd
+from matplotlib.axes import Axes
 
+from irlcli.report.drawing import panels, save
 from irlcli.report.lineage import commits, duration
 from irlcli.report.parameters import Cell, Run
 from irlcli.report.tables import Table, markdown_table
@@ -143,23 +141,18 @@ def draw(directory: Path, cells: Sequence[Cell], learning: Mapping[str, pd.DataF
         metrics = learning.get(f"{cell.row.split()[0]} {cell.place} learning")
         if cell.agent == "expert" and metrics is not None:
             curves.setdefault(cell.row, []).append((cell, metrics))
-    with plt.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
-        size = (9, 0.4 + 1.9 * len(curves))
-        figure, axes = plt.subplots(
-            len(curves), 2, figsize=size, squeeze=False, layout="constrained"
-        )
+    with matplotlib.rc_context(
+        {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
+    ):
+        figure, axes = panels(len(curves), 2, (9, 0.4 + 1.9 * len(curves)))
         for line, (row, experts) in zip(axes, curves.items(), strict=True):
             for axis, name in zip(line, ("true_return", "progress"), strict=True):
                 _panel(axis, f"{row}: {name.replace('_', ' ')}", name, experts)
             line[0].legend(frameon=False, fontsize=7)
-        figure.savefig(directory / "experts.png", dpi=110)
-        figure.savefig(directory / "experts.pdf", metadata={"CreationDate": None})
-        plt.close(figure)
+        save(figure, directory, "experts", dpi=110)
 
 
-def _panel(
-    axis: plt.Axes, title: str, name: str, experts: Sequence[tuple[Cell, pd.DataFrame]]
-) -> None:
+def _panel(axis: Axes, title: str, name: str, experts: Sequence[tuple[Cell, pd.DataFrame]]) -> None:
     if not any(metrics[name].notna().any() for _, metrics in experts):
         axis.set_axis_off()
         return

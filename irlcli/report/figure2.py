@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
+from irlcli.report.drawing import save
 from irlcli.report.statistics import bootstrap_interval
 from irlcli.report.tables import markdown_table
 
@@ -185,8 +183,8 @@ def draw(
         "(solid) and blocked=2 (dotted) if no move slips; it ends at the dot.\nCurves and table: "
         f"means over {summarised['datasets'].iloc[0]} datasets, with bootstrap 95 % intervals."
     )
-    with plt.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
-        figure = plt.figure(figsize=(15, 17), layout="constrained")
+    with matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
+        figure = Figure(figsize=(15, 17), layout="constrained")
         figure.suptitle(caption, fontsize=10)
         grid = figure.add_gridspec(4, 1, height_ratios=[3.7, 3.7, 3.2, 6.5])
         tops = [grid[i].subgridspec(1, 4) for i in range(2)]
@@ -196,9 +194,7 @@ def draw(
             _draw_reward(figure, axis, maze, panel, chr(ord("b") + k))
         _draw_curves(figure, grid[2].subgridspec(1, 3), summarised, lines, list(maze.bars))
         _draw_table(figure.add_subplot(grid[3]), summarised, list(maze.bars))
-        figure.savefig(directory / "figure2.png", dpi=130)
-        figure.savefig(directory / "figure2.pdf", metadata={"CreationDate": None})
-        plt.close(figure)
+        save(figure, directory, "figure2")
 
 
 def _frame(axis, size: int) -> None:

@@ -9,17 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from irlcli.report import ablation
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, colours, title
 from irlcli.report.build import Report
 from irlcli.report.compute import sample
+from irlcli.report.drawing import panels, save
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.result_tables import paper_row
 
@@ -39,7 +38,7 @@ INK = "#010203"
 @contextmanager
 def style(ink: str) -> Iterator[None]:
     """The style of every plot here, drawn in ``ink``."""
-    with plt.rc_context(
+    with matplotlib.rc_context(
         {
             "text.color": ink,
             "axes.edgecolor": ink,
@@ -58,7 +57,7 @@ def style(ink: str) -> Iterator[None]:
         yield
 
 
-def as_svg(figure: plt.Figure, name: str) -> str:
+def as_svg(figure: Figure, name: str) -> str:
     """``figure`` as an SVG element that takes its ink from the surrounding text.
 
     Its ids start with ``name``, because one page holds several.
@@ -66,7 +65,6 @@ def as_svg(figure: plt.Figure, name: str) -> str:
     buffer = io.StringIO()
     no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(buffer, format="svg", transparent=True, metadata=no_metadata)
-    plt.close(figure)
     text = buffer.getvalue()
     text = re.sub(r'( id="|url\(#|href="#)', rf"\g<1>{name}-", text[text.index("<svg") :])
     return text.replace(INK, "currentColor").strip()
@@ -75,24 +73,19 @@ def as_svg(figure: plt.Figure, name: str) -> str:
 def draw_points(directory: Path, p: Parameters, report: Report) -> str:
     """Write ``KIND.png`` and ``KIND.pdf``: every seed, the mean and its interval. Return the SVG."""
     with style("black"):
-        figure = _figure(p, report)
-        figure.savefig(directory / f"{p.kind}.png", dpi=130)
-        figure.savefig(directory / f"{p.kind}.pdf", metadata={"CreationDate": None})
-        plt.close(figure)
+        save(_figure(p, report), directory, p.kind)
     with style(INK):
         return as_svg(_figure(p, report), "points")
 
 
-def _figure(p: Parameters, report: Report) -> plt.Figure:
+def _figure(p: Parameters, report: Report) -> Figure:
     return ablation.figure(p, report.shares) if p.variants else _points(p, report)
 
 
-def _points(p: Parameters, report: Report) -> plt.Figure:
+def _points(p: Parameters, report: Report) -> Figure:
     measures = [m for m in p.measures if m != "id"] or ["id"]
     size = (0.6 + 3.2 * len(p.rows), 0.5 + 2.7 * len(measures))
-    figure, axes = plt.subplots(
-        len(measures), len(p.rows), figsize=size, squeeze=False, layout="constrained"
-    )
+    figure, axes = panels(len(measures), len(p.rows), size)
     for line, measure in zip(axes, measures, strict=True):
         for axis, row in zip(line, p.rows, strict=True):
             _panel(axis, p, report, row, measure)
@@ -101,8 +94,8 @@ def _points(p: Parameters, report: Report) -> plt.Figure:
     return figure
 
 
-def _panel(axis: plt.Axes, p: Parameters, report: Report, row: Row, measure: str) -> None:
-    ink = plt.rcParams["text.color"]
+def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) -> None:
+    ink = matplotlib.rcParams["text.color"]
     cells = report.cells[report.cells["row"] == row.name].set_index(["agent", "measure"])
     for agent in BASELINES:
         # Drawn even without a value, because all panels share the first one's legend.
@@ -170,20 +163,12 @@ def learning_curves(p: Parameters, learning: Mapping[str, pd.DataFrame]) -> dict
     return found
 
 
-def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> plt.Figure:
+def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> Figure:
     first = next(iter(runs.values()))
     settings = list(dict.fromkeys(first["setting"]))
     names = [n for n in _LEARNING if n in first and first[n].notna().any()]
     size = (1 + 3.6 * len(settings), 0.6 + 1.7 * len(names))
-    figure, axes = plt.subplots(
-        len(names),
-        len(settings),
-        figsize=size,
-        squeeze=False,
-        sharex=True,
-        sharey="row",
-        layout="constrained",
-    )
+    figure, axes = panels(len(names), len(settings), size, sharex=True, sharey="row")
     for line, name in zip(axes, names, strict=True):
         for axis, setting in zip(line, settings, strict=True):
             for method, colour in colours(p.methods).items():
@@ -211,7 +196,7 @@ def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> plt.
     return figure
 
 
-def _add_legend(figure: plt.Figure, axis: plt.Axes) -> None:
+def _add_legend(figure: Figure, axis: Axes) -> None:
     """One legend for all panels, below them, in as many columns as the figure is wide enough for."""
     handles, labels = axis.get_legend_handles_labels()
     # An entry takes up to 1.8 inches; the layout cuts what does not fit.

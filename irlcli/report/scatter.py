@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
 from irlcli.data.descriptions import Assessment, BankEntry
+from irlcli.report import drawing
 from irlcli.report.agents import title
 from irlcli.report.compute import Assessments
 from irlcli.report.parameters import Parameters
-from irlcli.report.plots import INK, as_svg, plt, style
+from irlcli.report.plots import INK, as_svg, style
 
 # Kind of policy to its name in the legend and to Okabe and Ito's colours.
 KINDS = {
@@ -22,13 +26,14 @@ KINDS = {
     "retrained": ("retrained", "#D55E00"),
     "from-student": ("retrained from the student", "#CC79A7"),
 }
+_DPI = 110
 
 
 def draw_bank(directory: Path, assessment: Assessment) -> None:
     """Write ``scatter.png`` and ``scatter.svg``: a panel for each setting."""
     panels = [_by_setting(assessment)]
     with style("black"):
-        _save(_scatter(panels), directory / "scatter.png")
+        _scatter(panels).savefig(directory / "scatter.png", dpi=_DPI)
     with style(INK):
         (directory / "scatter.svg").write_text(as_svg(_scatter(panels), "scatter") + "\n")
 
@@ -52,7 +57,7 @@ def draw_banks(directory: Path, p: Parameters, assessments: Assessments) -> dict
         if not lines:
             continue
         with style("black"):
-            _save(_scatter(lines), directory / f"bank-{row.env}-{row.knob}.png")
+            _scatter(lines).savefig(directory / f"bank-{row.env}-{row.knob}.png", dpi=_DPI)
         with style(INK):
             name = f"{row.name}: the bank's policies, bars are standard errors over episodes"
             found[name] = as_svg(_scatter(lines), f"bank{len(found)}")
@@ -66,16 +71,11 @@ def _by_setting(assessment: Assessment) -> dict[str, list[BankEntry]]:
     }
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def _scatter(lines: Sequence[Mapping[str, Sequence[BankEntry]]]) -> plt.Figure:
+def _scatter(lines: Sequence[Mapping[str, Sequence[BankEntry]]]) -> Figure:
     """A panel for each title; bars are standard errors over episodes."""
     wide = max(len(panels) for panels in lines)
     size = (0.6 + 3.4 * wide, 0.6 + 3.0 * len(lines))
-    figure, axes = plt.subplots(len(lines), wide, figsize=size, squeeze=False, layout="constrained")
+    figure, axes = drawing.panels(len(lines), wide, size)
     for line, panels in zip(axes, lines, strict=True):
         line[0].set_ylabel("learned return")
         for axis, (heading, entries) in zip(line, panels.items(), strict=True):
@@ -95,7 +95,7 @@ def _scatter(lines: Sequence[Mapping[str, Sequence[BankEntry]]]) -> plt.Figure:
         axis.set_xlabel("true return")
     drawn = {e.kind for panels in lines for entries in panels.values() for e in entries}
     handles = [
-        plt.Line2D([], [], marker="o", ls="", color=colour, label=name)
+        Line2D([], [], marker="o", ls="", color=colour, label=name)
         for kind, (name, colour) in KINDS.items()
         if kind in drawn
     ]

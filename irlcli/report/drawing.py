@@ -1,0 +1,18 @@
+"""Figures without pyplot: the backend that it would choose belongs to the caller, a notebook say."""
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+
+def panels(rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:
+    """A figure of ``size`` [inch] and its axes [rows, columns]; ``shared`` as for ``subplots``."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **shared)
+
+
+def save(figure: Figure, directory: Path, name: str, dpi: int = 130) -> None:
+    """Write ``NAME.png`` and ``NAME.pdf``: the same bytes each time."""
+    figure.savefig(directory / f"{name}.png", dpi=dpi)
+    figure.savefig(directory / f"{name}.pdf", metadata={"CreationDate": None})
