@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any
 
@@ -72,7 +72,7 @@ def build(
     against_zero_shot = retrained.against_zero_shot(p, points)
     learned_returns = compute.learned_returns(p, points)
     discriminators = compute.discriminator_ends(p, learning)
-    quality = compute.reward_quality(p, assessments)
+    reward_quality = compute.reward_quality(p, assessments)
     cue_contrasts = cue.cue_contrasts(p, contrasts)
     shares = ablation.shares(p, points) if p.variants else pd.DataFrame()
     variants = ablation.summarise_variants(p, shares) if p.variants else pd.DataFrame()
@@ -83,7 +83,7 @@ def build(
         result_tables.by_training_setting(by_training_setting),
         result_tables.against_zero_shot(against_zero_shot),
         result_tables.learned_returns(learned_returns),
-        result_tables.reward_quality(quality),
+        result_tables.reward_quality(reward_quality),
         result_tables.comparisons(p, comparisons),
         result_tables.discriminators(discriminators),
         result_tables.cells(cells),
@@ -95,7 +95,7 @@ def build(
         *caveats.weak_experts(p, cells, assessments),
         *caveats.not_imitated(cells),
         *caveats.short_of_expert(learned_returns),
-        *caveats.yardsticks(cells, verdicts=not (learned_returns.empty and quality.empty)),
+        *caveats.yardsticks(cells, verdicts=not (learned_returns.empty and reward_quality.empty)),
         *caveats.saturated(discriminators),
         *caveats.identical(episodes),
         *ablation.without_effect(p),
@@ -104,43 +104,29 @@ def build(
         *caveats.left_out(p),
         *caveats.mixed(p),
     ]
-    tables = [table for table in tables if table.rows]
     return Report(
-        points,
-        cells,
-        comparisons,
-        by_training_setting,
-        against_zero_shot,
-        learned_returns,
-        discriminators,
-        quality,
-        cue_contrasts,
-        shares,
-        variants,
-        tables,
-        found,
+        points=points,
+        cells=cells,
+        comparisons=comparisons,
+        by_training_setting=by_training_setting,
+        against_zero_shot=against_zero_shot,
+        learned_returns=learned_returns,
+        discriminators=discriminators,
+        reward_quality=reward_quality,
+        cue_contrasts=cue_contrasts,
+        shares=shares,
+        variants=variants,
+        tables=[table for table in tables if table.rows],
+        caveats=found,
     )
 
 
 def as_json(report: Report) -> dict[str, Any]:
     """The report as JSON values; missing numbers are None."""
+    return {field.name: _plain(getattr(report, field.name)) for field in fields(report)}
 
-    def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-        plain = table.astype(object).where(table.notna(), None)
-        return plain.to_dict("records")
 
-    return {
-        "cells": records(report.cells),
-        "comparisons": records(report.comparisons),
-        "by_training_setting": records(report.by_training_setting),
-        "against_zero_shot": records(report.against_zero_shot),
-        "learned_returns": records(report.learned_returns),
-        "discriminators": records(report.discriminators),
-        "reward_quality": records(report.reward_quality),
-        "cue_contrasts": records(report.cue_contrasts),
-        "shares": records(report.shares),
-        "variants": records(report.variants),
-        "points": records(report.points),
-        "tables": [table._asdict() for table in report.tables],
-        "caveats": report.caveats,
-    }
+def _plain(part: pd.DataFrame | list[Table] | list[str]) -> list[Any]:
+    if isinstance(part, pd.DataFrame):
+        return part.astype(object).where(part.notna(), None).to_dict("records")
+    return [item._asdict() if isinstance(item, Table) else item for item in part]
