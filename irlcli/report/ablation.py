@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from irlcli.report.agents import title
-from irlcli.report.compute import whole_seeds
+from irlcli.report.compute import points_of, whole_seeds
 from irlcli.report.drawing import panels
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.statistics import holm, paired_p, summarise
@@ -90,7 +90,8 @@ def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
                     "seeds": s.n,
                     "mean": s.mean,
                     "deviation": s.deviation,
-                    **{f"passed_{gate:.0%}"[:-1]: int((values >= gate).sum()) for gate in GATES},
+                    "passed_80": int((values >= 0.8).sum()),
+                    "passed_90": int((values >= 0.9).sum()),
                     "progress": progress.mean(),
                     "student": student.mean(),
                     "difference": (values[common] - base[common]).mean() if compared else None,
@@ -101,7 +102,8 @@ def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
                 }
             )
         adjusted = holm([line["p_paired"] for line in lines])
-        rows += [{**li, "p_paired_holm": p} for li, p in zip(lines, adjusted, strict=True)]
+        for line, value in zip(lines, adjusted, strict=True):
+            rows.append({**line, "p_paired_holm": value})
     return pd.DataFrame(rows)
 
 
@@ -109,9 +111,7 @@ def over_settings(
     found: pd.DataFrame, row: Row, variant: str, measure: str, column: str = "share"
 ) -> pd.Series:
     """The mean share over ``row``'s training settings by seed, of seeds that have all of them."""
-    chosen = found[
-        (found["row"] == row.name) & (found["agent"] == variant) & (found["measure"] == measure)
-    ]
+    chosen = points_of(found, row.name, variant, measure)
     by_seed = chosen.pivot(index="seed", columns="setting", values=column)
     return by_seed.reindex(columns=list(row.trained)).dropna().mean(axis=1)
 
@@ -145,12 +145,8 @@ def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Ta
 
 
 def _setting(found: pd.DataFrame, row: Row, variant: str, setting: str) -> str:
-    chosen = found[
-        (found["row"] == row.name)
-        & (found["agent"] == variant)
-        & (found["measure"] == _RETRAINED)
-        & (found["setting"] == setting)
-    ]
+    chosen = points_of(found, row.name, variant, _RETRAINED)
+    chosen = chosen[chosen["setting"] == setting]
     return _spread(chosen.set_index("seed")["share"].sort_index().dropna())
 
 

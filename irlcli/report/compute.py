@@ -244,9 +244,10 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     for row in p.rows if "transfer" in p.measures else ():
         random = sample(points, row.name, "random", "ood")["true_return"].mean()
         for method in p.methods:
-            of = points[(points["row"] == row.name) & (points["agent"] == method)]
-            of = of[of["learned_return"].notna()]
-            policies, experts = (of[of["measure"] == m] for m in ("transfer", EXPERT_BY_REWARD))
+            policies, experts = (
+                points_of(points, row.name, method, m).dropna(subset="learned_return")
+                for m in ("transfer", EXPERT_BY_REWARD)
+            )
             policies = policies[["seed", "true_return", "learned_return"]]
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
