@@ -292,7 +292,7 @@ def _make_all(
     session: StageSession, runner: "Runner", found: "Plan", choice: Choice, jobs: int
 ) -> "Outcome":
     from irlcli.cli.jobs import job_display
-    from irlcli.experiments.execute import execute
+    from irlcli.experiments.execute import Execution
 
     words = _child_words(session, choice, found)
     display = job_display(session.console)
@@ -301,7 +301,7 @@ def _make_all(
         return [sys.executable, "-m", "irlcli", *words(name)]
 
     try:
-        return execute(found, runner, command, jobs, display)
+        return Execution(found, runner, command, jobs, display).run()
     finally:
         display.close()
 

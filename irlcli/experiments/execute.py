@@ -17,7 +17,6 @@ from irlcli.experiments.failures import LAST_LINES, Failure, failure
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.runner import Runner
 from irlcli.experiments.signals import stop_requests
-from irlcli.stages import choose_penalty
 from irlcli.store import Artefact
 
 _POLL_SECONDS = 0.05
@@ -113,14 +112,8 @@ class _Child:
         return failure(self.process.returncode, self.last)
 
 
-def execute(
-    plan: Plan,
-    runner: Runner,
-    command: Callable[[str], Sequence[str]],
-    jobs: int,
-    display: Display,
-) -> Outcome:
-    """Make the missing steps of ``plan``, ``jobs`` at a time, and name all artefacts.
+class Execution:
+    """The making of what a plan is missing, which also names all artefacts.
 
     Args:
         plan: what to make.
@@ -129,10 +122,7 @@ def execute(
         jobs: processes at a time.
         display: receives what happens.
     """
-    return _Execution(plan, runner, command, jobs, display).run()
 
-
-class _Execution:
     def __init__(
         self,
         plan: Plan,
@@ -155,6 +145,7 @@ class _Execution:
         self._outcome = Outcome([], [], [], {}, [], False)
 
     def run(self) -> Outcome:
+        """Make the missing steps, several at a time, until all exist or nothing more can be made."""
         there = [name for name in self._waiting if self._plan.step(name).status == "HIT"]
         for name in there:
             self._finish(name)
@@ -215,7 +206,7 @@ class _Execution:
         self._show_lines()
         if child.process.returncode == 0:
             self._plan.lookup.forget_missing()
-            if self._plan.tasks[child.name].request.stage == choose_penalty.STAGE:
+            if self._plan.chooses(child.name):
                 self._plan.refresh()
             if self._plan.step(child.name).status == "HIT":
                 self._finish(child.name)

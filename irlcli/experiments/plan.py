@@ -15,6 +15,7 @@ from irlcli.experiments.rows import PHASES, Chosen, Run, Task
 from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
 from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
+from irlcli.stages import choose_penalty
 from irlcli.stages.base import From, Request
 
 
@@ -174,6 +175,10 @@ class Plan:
     def exists(self, name: str) -> bool:
         """Whether the step's artefact is in the store or in another one."""
         return self.lookup(self.tasks[name].request).artefact is not None
+
+    def chooses(self, name: str) -> bool:
+        """Whether the step chooses a lambda: once it exists, later requests differ (:meth:`refresh`)."""
+        return self.tasks[name].request.stage == choose_penalty.STAGE
 
     def counts(self) -> dict[str, int]:
         """How many steps have each status."""

@@ -7,7 +7,6 @@ from typing import NamedTuple, Protocol
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import Record, records
 from irlcli.experiments.plan import Plan
-from irlcli.stages import choose_penalty
 from irlcli.store import Store
 
 
@@ -60,9 +59,9 @@ def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
                 by_identity[identity] = by_name[name] = Queued(job, states[job], record)
     found = {}
     changing: set[str] = set()
-    for name, task in plan.tasks.items():
+    for name in plan.tasks:
         there = by_identity.get(plan.identities[name])
-        if task.request.stage == choose_penalty.STAGE or not changing.isdisjoint(plan.needs[name]):
+        if plan.chooses(name) or not changing.isdisjoint(plan.needs[name]):
             # Once a lambda is chosen, the reward is another request under the same name.
             changing.add(name)
             there = there or by_name.get(name)

@@ -23,7 +23,6 @@ from irlcli.experiments.failures import Failure
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.runner import Runner
 from irlcli.experiments.signals import stop_requests
-from irlcli.stages import choose_penalty
 
 _LONGEST_PAUSE = 20.0
 # A controller that restarts, or is too busy to answer, comes back.
@@ -249,7 +248,7 @@ class Submission:
         if step.status == "HIT" and step.artefact is not None:
             self._runner.store.set_name(name, step.artefact)
             self._outcome.made.append(name)
-            if self._plan.tasks[name].request.stage == choose_penalty.STAGE:
+            if self._plan.chooses(name):
                 self._plan.refresh()
             self._display.done(name, time.monotonic() - since)
             return True
