@@ -72,8 +72,6 @@ def tables(incomplete: str) -> list[tuple[str, str]]:
 
 def reports(incomplete: str) -> list[tuple[str, str]]:
     """What ``irl report`` writes, with titles."""
-    own = [
-        ("returns", "True returns of evaluations"),
-        ("table2", "Table 2: the values of the interventions"),
-    ]
-    return own + tables(incomplete)
+    from irlcli.experiments.tables import REPORTS
+
+    return [*REPORTS.items(), *tables(incomplete)]

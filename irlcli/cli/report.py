@@ -25,7 +25,7 @@ from irlcli.cli.table_report import (
     report_of,
 )
 from irlcli.envs.registry import ENVIRONMENTS
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import UsageError
 from irlcli.requests.session import DEFAULT_PROFILE
 from irlcli.requests.tables import Choice, open_plan
 from irlcli.store import Artefact
@@ -94,19 +94,9 @@ def report(
             _table2(session, form)
         case _:
             chosen = Choice(kind, seeds, methods, rows, choose_penalty, file=file)
-            _check_kind(chosen)
             if form is not None:
                 raise UsageError(f"{kind} takes no --format", "omit --format")
             _table(session, chosen, name, directory)
-
-
-def _check_kind(chosen: Choice) -> None:
-    from irlcli.experiments.tables import load_tables
-
-    tables = load_tables(chosen.file)
-    if chosen.table not in tables:
-        known = ["returns", "table2", *tables]
-        raise UsageError(f"unknown report {chosen.table!r}", suggest(chosen.table, known))
 
 
 def _of_stages(session: StageSession) -> dict[str, Any]:

@@ -22,8 +22,11 @@ Measure = Literal["transfer", "from-student", "zero-shot", "transfer-id", "id", 
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 _NAME = r"[a-z][a-z0-9-]{0,30}"
 _DEFAULTS = "defaults"
-# What `irl report` writes without a table.
-_REPORTS = ("returns", "table2")
+# What `irl report` writes without a table, and its title.
+REPORTS = {
+    "returns": "True returns of evaluations",
+    "table2": "Table 2: the values of the interventions",
+}
 _LARGEST = 1e300
 # What every comparison lists, or a file's defaults.
 _COMPARING = ("rows", "methods", "seeds", "measures")
@@ -109,10 +112,10 @@ def load_table(name: str, path: Path | None = None) -> Table:
         UsageError: no table has that name; or as :func:`load_tables`.
     """
     tables = load_tables(path)
-    if name == "table2":
-        raise UsageError("table2 has no steps", "`irl report table2` prints it from settings/")
+    if name in REPORTS:
+        raise UsageError(f"{name} has no steps", f"`irl report {name}` prints it")
     if name not in tables:
-        raise UsageError(f"unknown table {name!r}", suggest(name, tables))
+        raise UsageError(f"unknown table {name!r}", suggest(name, [*REPORTS, *tables]))
     table = tables[name]
     if table.kind == "experts":
         return msgspec.structs.replace(table, rows=_rows_of(*ENVIRONMENTS.values()))
@@ -186,7 +189,7 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
             f"{name!r} cannot be the name of a table",
             "a lowercase letter, then up to 30 lowercase letters, digits and '-'",
         )
-    if name in _REPORTS:
+    if name in REPORTS:
         raise UsageError(f"{name!r} is a report of its own", "give the table another name")
     fields = [*(f for f in Table.__struct_fields__ if f != "name"), "base"]
     _check_fields(value, name, fields)

@@ -354,7 +354,7 @@ def test_a_profile_without_runs_is_no_table(report, irl, table_store):
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["table3"], "unknown report 'table3'", "table1, table1-5, table2"),
+        (["table3"], "unknown table 'table3'", "table1, table1-5, table2"),
         (["table1", "--methods", "erm,irn"], "--methods: unknown 'irn'", "did you mean 'irm'"),
         (["table1", "--methods", "erm,erm"], "--methods: erm appears twice", "once"),
         (["table1", "--seeds", "0,0"], "--seeds: 0 appears twice", "once"),

@@ -155,6 +155,7 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         return done.err
 
     assert "unknown table 'tabel1'" in refused("plan", "tabel1")
+    assert "returns has no steps" in refused("plan", "returns")
     assert "did you mean 'table1'" in refused("run", "tabel1")
     assert "did you mean 'irm'" in refused("run", "table1", "--methods", "erm,imr")
     assert "--rows: unknown 'reacher'" in refused("plan", "table1", "--rows", "reacher")

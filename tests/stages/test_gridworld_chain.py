@@ -248,7 +248,7 @@ SIZE = ["--set", "gridworld.size=1024"]
         (["evaluate", "--random", "--env", "gridworld", "--intervention", "blocked=1"], "does not"),
         (["evaluate", "--expert", "--env", "gridworld", "--intervention", "blocked=1"], "does not"),
         (["transfer", "--reward", "learned", "--ood", "blocked=1"], "is a reward of MaxEnt IRL"),
-        (["report", "figure5"], "unknown report"),
+        (["report", "figure5"], "unknown table"),
         (["report", "figure2", "demos"], "no references"),
         (["report", "returns"], "name at least one evaluation"),
         (["report", "figure2", "--set", "figure2.episodes=[1,2]"], "2 episode counts"),
