@@ -93,10 +93,11 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     Raises:
         UsageError: an unknown name or option, or Slurm or submitit is missing.
     """
-    cluster = options.cluster or "slurm"
     from irlcli.experiments.cluster.local import Local
     from irlcli.experiments.cluster.slurm import Slurm
 
+    cluster = options.cluster
+    assert cluster is not None
     if cluster not in CLUSTERS:
         raise UsageError(f"unknown --cluster {cluster!r}", suggest(cluster, CLUSTERS))
     if importlib.util.find_spec("submitit") is None:

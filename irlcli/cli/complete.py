@@ -1,21 +1,21 @@
 """Values that the shell completes. Each function imports what it lists when it is asked."""
 
 
-def environments(incomplete: str) -> list[str]:
+def environments() -> list[str]:
     """Names of environments."""
     from irlcli.envs.registry import ENVIRONMENTS
 
     return list(ENVIRONMENTS)
 
 
-def methods(incomplete: str) -> list[tuple[str, str]]:
+def methods() -> list[tuple[str, str]]:
     """Names of methods, with their titles."""
     from irlcli.methods import METHODS
 
     return [(method.name, method.title) for method in METHODS.values()]
 
 
-def maxent_methods(incomplete: str) -> list[tuple[str, str]]:
+def maxent_methods() -> list[tuple[str, str]]:
     """Those of :func:`methods` that MaxEnt IRL has as well, with their titles."""
     from irlcli.methods import METHODS
     from irlcli.penalties import maxent_methods
@@ -23,7 +23,7 @@ def maxent_methods(incomplete: str) -> list[tuple[str, str]]:
     return [(name, METHODS[name].title) for name in maxent_methods()]
 
 
-def groupings(incomplete: str) -> list[str]:
+def groupings() -> list[str]:
     """Ways to group demonstrations."""
     from typing import get_args
 
@@ -32,12 +32,12 @@ def groupings(incomplete: str) -> list[str]:
     return list(get_args(Grouping))
 
 
-def airl_penalties(incomplete: str) -> list[str]:
+def airl_penalties() -> list[str]:
     """Penalties of adversarial learners."""
     return penalties("airl")
 
 
-def maxent_penalties(incomplete: str) -> list[str]:
+def maxent_penalties() -> list[str]:
     """Penalties of MaxEnt IRL."""
     return penalties("maxent")
 
@@ -49,29 +49,29 @@ def penalties(learner: str) -> list[str]:
     return [name for name, penalty in PENALTIES.items() if learner in penalty.learners]
 
 
-def algorithms(incomplete: str) -> list[str]:
+def algorithms() -> list[str]:
     """Names of retraining algorithms."""
     from irlcli.rl import ALGORITHMS
 
     return list(ALGORITHMS)
 
 
-def profiles(incomplete: str) -> list[str]:
+def profiles() -> list[str]:
     """Names of profiles."""
     from irlcli.configs import PROFILES
 
     return list(PROFILES)
 
 
-def tables(incomplete: str) -> list[tuple[str, str]]:
+def tables() -> list[tuple[str, str]]:
     """Names of tables and figures, with their titles."""
     from irlcli.experiments.tables import load_tables
 
     return [(table.name, table.title) for table in load_tables().values()]
 
 
-def reports(incomplete: str) -> list[tuple[str, str]]:
+def reports() -> list[tuple[str, str]]:
     """What ``irl report`` writes, with titles."""
     from irlcli.experiments.tables import REPORTS
 
-    return [*REPORTS.items(), *tables(incomplete)]
+    return [*REPORTS.items(), *tables()]

@@ -19,7 +19,7 @@ from irlcli.interventions import listed_settings
 _ACTIONS = ("list", "show", "check")
 
 
-def _actions(incomplete: str) -> list[str]:
+def _actions() -> list[str]:
     return list(_ACTIONS)
 
 

@@ -99,9 +99,9 @@ def plan(
 
 
 def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
-    command = _child_words(session, choice, found)
     steps, counts = steps_of(found), found.counts()
     if session.as_json:
+        command = _child_words(session, choice, found)
         for step in steps:
             step["command"] = ["irl", *command(step["name"])]
         out.print_json("plan", {"table": choice.table, "counts": counts, "steps": steps})

@@ -93,7 +93,6 @@ def _spaces(env: str, setting: str) -> tuple[Any, Any, Any]:
 
 
 def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
-    references.tensor_file(session.store, ref, "reward")
     with _new_file(session, Path(name)) as path:
         from irlcli.data.exchange.torch_export import write_reward
         from irlcli.rewards import load_reward

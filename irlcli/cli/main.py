@@ -102,7 +102,7 @@ def _usage(error: Any) -> UsageError:
     if missing and "--experiments" not in sys.argv:
         from irlcli.cli import complete
 
-        known = complete.tables("") if missing[1] == "TABLE" else complete.reports("")
+        known = complete.tables() if missing[1] == "TABLE" else complete.reports()
         hint = f"known: {', '.join(name for name, _ in known)}"
     return UsageError(message[0].lower() + message[1:], hint)
 
@@ -124,7 +124,3 @@ def _fail(error: IrlError) -> None:
 
 def _debugging() -> bool:
     return "--debug" in sys.argv
-
-
-if __name__ == "__main__":
-    main()

@@ -33,7 +33,7 @@ from irlcli.store import Artefact
 _FORMS = ("text", "markdown", "latex")
 
 
-def _forms(incomplete: str) -> list[str]:
+def _forms() -> list[str]:
     return list(_FORMS)
 
 

@@ -187,19 +187,19 @@ class StageSession(base.StageSession):
             if not any(f"{field}.".startswith(f"{part}.") for part in read):
                 self.console.warn(f"no stage of this command reads --set {item}")
 
-    def prepare(self, request: "Request", then: str) -> Artefact | None:
+    def prepare(self, request: "Request") -> Artefact | None:
         """The artefact of ``request``, not printed.
 
-        With ``--dry-run`` None if it is missing; the printed plan then shows ``then`` as blocked.
+        With ``--dry-run`` None if it is missing; the printed plan shows ``train-airl`` as blocked.
         """
         self._prepared.append(request)
         if not self.dry_run:
-            return super().prepare(request, then)
+            return super().prepare(request)
         from irlcli.experiments.status import Step
 
         steps = self.runner().plan(request)
         if steps[-1].artefact is None:
-            self.print_plan([*steps, Step("BLOCKED", then, f"waits for {request.label}")])
+            self.print_plan([*steps, Step("BLOCKED", "train-airl", f"waits for {request.label}")])
         return steps[-1].artefact
 
     def print_plan(self, steps: Sequence["Step"]) -> None:

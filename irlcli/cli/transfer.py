@@ -26,7 +26,7 @@ def transfer(
     algorithm: Annotated[
         str | None,
         typer.Option(
-            help=f"Retraining algorithm: {', '.join(complete.algorithms(''))}.",
+            help=f"Retraining algorithm: {', '.join(complete.algorithms())}.",
             autocompletion=complete.algorithms,
         ),
     ] = None,

@@ -438,7 +438,7 @@ class Lab:
             file=None if settings is None else Path(settings),
             overrides=merged(self.set, overrides(configs.get("set", ()))),
             sources=self.sources,
-            command=line,
+            command=(),
             wait=self.wait,
             workers=self.workers,
             read_only=read_only,

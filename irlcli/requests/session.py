@@ -201,8 +201,8 @@ class StageSession(Session):
                 self.store.set_name(name, artefacts[0])
         return artefacts
 
-    def prepare(self, request: "Request", then: str) -> Artefact | None:
-        """The artefact of ``request``, on which the request of the stage ``then`` depends.
+    def prepare(self, request: "Request") -> Artefact | None:
+        """The artefact of ``request``, on which the request of ``train-airl`` depends.
 
         None if nothing may be run, and it is missing.
         """

@@ -86,7 +86,7 @@ def train_airl(
 
 def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | None:
     """The lambda that ``request`` chooses, and the file that says so; None if nothing may be run."""
-    made = session.prepare(request, "train-airl")
+    made = session.prepare(request)
     if made is None:
         return None
     path = session.store.open(made, "choice.json")
