@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from report_examples import BOUNCE, complete, example, metrics, run_of
 
 from irlcli.report import page, plots
+from irlcli.report.agents import colours
 from irlcli.report.build import as_json, build
 
 
@@ -100,16 +101,24 @@ def test_markdown_tables_are_rectangular():
         assert len({line.count("|") for line in block.splitlines()}) == 1
 
 
-@pytest.mark.parametrize("method", ["irm", "mine"])
-def test_every_seed_is_plotted(tmp_path, method):
+@pytest.mark.parametrize(
+    ("method", "markers"),
+    [("irm", 2 * 2 * 3), ("mine", 1 * 1 * 3)],  # rows, measures, seeds
+)
+def test_every_seed_is_plotted(tmp_path, method, markers):
     """``mine`` is in no table of methods."""
     values = complete() | {(BOUNCE, method, "transfer"): [1.0, 2.0, 4.0]}
     p, points = example(values, methods=("erm", method))
     svg = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
-    assert parsed(svg) and svg.startswith("<svg")
-    assert (tmp_path / "table1.png").stat().st_size and (tmp_path / "table1.pdf").stat().st_size
-    again = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
-    assert again == svg
+    parsed(svg)
+    drawn = {
+        name: svg.count(f"fill: {colour.lower()}; fill-opacity: 0.6")
+        for name, colour in colours(p.methods).items()
+    }
+    assert drawn == {"erm": 2 * 2 * 3, method: markers}
+    assert plots.draw_points(tmp_path, p, build(p, points, {}, {})) == svg
+    assert (tmp_path / "table1.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "table1.pdf").read_bytes().startswith(b"%PDF")
 
 
 @pytest.mark.parametrize("rows", [1, 2])
