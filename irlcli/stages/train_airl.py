@@ -15,7 +15,7 @@ from irlcli.configs import AIRLConfig
 from irlcli.configs.relevance import relevant_airl
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.interventions import Setting, check_tabular, parse_setting
+from irlcli.interventions import Setting, check_tabular, env_kwargs, parse_setting
 from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import (
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from irlcli.learners.selection import BestRound
     from irlcli.rl.loop import LastRound
     from irlcli.rl.worlds import Worlds
+    from irlcli.symmetries import Symmetries
     from irlcli.trajectories import Trajectory
 
 
@@ -290,9 +291,21 @@ def _learner(
             observation_size=size,
             actions=action_space(worlds.action_space),
             seed=p.seed,
+            symmetries=_symmetries(env, settings) if airl.symmetries is True else None,
         )
     except ValueError as error:
         raise IntegrityError(f"{env}: {error}") from None
+
+
+def _symmetries(env: str, settings: Sequence[str]) -> Symmetries:
+    from pkgutil import resolve_name
+
+    place = environment(env).symmetries
+    assert place is not None
+    found: Symmetries = resolve_name(place)(
+        [env_kwargs(env, parse_setting(env, text)) for text in settings]
+    )
+    return found
 
 
 def _selector(
