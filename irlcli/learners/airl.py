@@ -95,7 +95,7 @@ class AIRL:
         observation_size: D.
         actions: the environment's actions.
         seed: initialisation and every minibatch derive from it.
-        symmetries: of the environment, for ``config.symmetries``.
+        symmetries: of the environment; None: samples are used as they are.
 
     Raises:
         ValueError: the demonstrations have other observations or actions than the environment.
@@ -114,7 +114,7 @@ class AIRL:
         symmetries: Symmetries | None = None,
     ):
         self.config = config
-        self._images = None if symmetries is None else Images(symmetries)
+        self._images = Images(symmetries)
         self.view = ActionView(config.actions, actions)
         self._rounds = rounds
         self._horizon = horizon
@@ -271,18 +271,14 @@ class AIRL:
         ]
 
     def _normalise(self, observations: Sequence[np.ndarray], index: int) -> None:
-        """Add ``observations``, or an image of each, to the moments of the model's input."""
+        """Add images of ``observations`` to the moments of the model's input."""
+        generator = torch.Generator().manual_seed(derive("images", self._seed, index)[0])
         added = torch.as_tensor(np.concatenate(observations))
-        if self._images is not None:
-            generator = torch.Generator().manual_seed(derive("images", self._seed, index)[0])
-            added = self._images.of_observations(added, generator)
-        self.model.normaliser.update(added)
+        self.model.normaliser.update(self._images.of_observations(added, generator))
 
-    def _sampled(
-        self, risks: Sequence[Sequence[Stratum]], generator: torch.Generator
-    ) -> Minibatch:
+    def _sampled(self, risks: Sequence[Sequence[Stratum]], generator: torch.Generator) -> Minibatch:
         batch = sample_minibatch(risks, generator, self.config.replay_share)
-        return batch if self._images is None else self._images.of(batch, generator)
+        return self._images.of(batch, generator)
 
     def _optimise(
         self,

@@ -15,7 +15,7 @@ from irlcli.configs import AIRLConfig
 from irlcli.configs.relevance import relevant_airl
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.interventions import Setting, check_tabular, env_kwargs, parse_setting
+from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import (
@@ -84,6 +84,8 @@ def request(
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
     relevant = relevant_airl(airl, environment(env).discrete_actions)
+    if relevant.symmetries is True and environment(env).symmetries is None:
+        raise UsageError(f"airl.symmetries: {env} has none", "omit airl.symmetries")
     _check_rounds(relevant)
     if trained == 1:
         relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))
@@ -291,20 +293,23 @@ def _learner(
             observation_size=size,
             actions=action_space(worlds.action_space),
             seed=p.seed,
-            symmetries=_symmetries(env, settings) if airl.symmetries is True else None,
+            symmetries=_symmetries(p, settings),
         )
     except ValueError as error:
         raise IntegrityError(f"{env}: {error}") from None
 
 
-def _symmetries(env: str, settings: Sequence[str]) -> Symmetries:
-    from pkgutil import resolve_name
+def _symmetries(p: Parameters, settings: Sequence[str]) -> Symmetries | None:
+    from irlcli.envs.registration import symmetries
 
-    place = environment(env).symmetries
-    assert place is not None
-    found: Symmetries = resolve_name(place)(
-        [env_kwargs(env, parse_setting(env, text)) for text in settings]
-    )
+    if p.airl.symmetries is not True:
+        return None
+    env = p.environment.name
+    found = symmetries(env, [parse_setting(env, text) for text in settings])
+    if len(found.actions) == 1:
+        raise UsageError(
+            f"airl.symmetries: {env} has none in {', '.join(settings)}", "omit airl.symmetries"
+        )
     return found
 
 
