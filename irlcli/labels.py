@@ -115,6 +115,7 @@ def learned(config: Mapping[str, Any]) -> str:
             "from a clone" if config.get("bc_epochs") else None,
             _averaged(config),
             "to a plateau" if config.get("plateau_rounds") else None,
+            "with symmetries" if config.get("symmetries") else None,
             _challenged(challenger) if isinstance(challenger, dict) else None,
         ]
     )

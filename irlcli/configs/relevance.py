@@ -122,6 +122,7 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         airl = replace(airl, penalty_scaling=_AIRL.penalty_scaling)
     if not airl.shaping and airl.policy_reward == "g":
         airl = replace(airl, policy_reward="f")
+    airl = _symmetric(airl)
     airl = _challenger(airl, discrete_actions)
     airl = _replay(airl)
     return replace(airl, ppo=relevant_ppo(airl.ppo, discrete_actions, "airl.ppo"))
@@ -186,6 +187,17 @@ def _kept_rounds(airl: AIRLConfig) -> AIRLConfig:
         airl = replace(airl, select_every=_AIRL.select_every)
     if airl.select in ("last", "episodes"):
         airl = replace(airl, select_episodes=_AIRL.select_episodes)
+    return airl
+
+
+def _symmetric(airl: AIRLConfig) -> AIRLConfig:
+    if not airl.symmetries:
+        return replace(airl, symmetries=UNSET)
+    if airl.logit != "f":
+        raise UsageError(
+            "airl.symmetries needs logits without log pi: the policy gives an image another one",
+            "--set airl.logit=f, and --set airl.policy_reward to f or g",
+        )
     return airl
 
 

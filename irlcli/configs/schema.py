@@ -46,6 +46,7 @@ UNSET_MEANS: dict[str, Any] = {
     "columns": (),
     "averaged_rounds": 1,
     "averaged_by": "rounds",
+    "symmetries": False,
     "penalty_warmup_iterations": 0,
 }
 
@@ -262,6 +263,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is
             near chance and has not risen for so many rounds, those of the penalty's warm-up and ramp
             not counted (:mod:`irlcli.learners.stopping`). Unset trains to the end, and is in no key.
+        symmetries: the discriminator sees images of its samples under the environment's symmetries, see
+            :mod:`irlcli.learners.images`. Unset is false, and in no key.
         select: the round that is kept: ``last``, the best on held-out ``episodes``, or the best in
             one setting (``leg-length=1x``), which is left out of training. Scored every
             ``select_every`` rounds, a setting over ``select_episodes``.
@@ -306,6 +309,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     averaged_rounds: Members | UnsetType = UNSET
     averaged_by: Averaged | UnsetType = UNSET
     plateau_rounds: Count | UnsetType = UNSET
+    symmetries: bool | UnsetType = UNSET
 
 
 class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

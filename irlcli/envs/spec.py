@@ -126,6 +126,8 @@ class EnvironmentSpec(NamedTuple):
             it with each change that alters trajectories.
         transition_reward: ``module:function`` of the true reward [B] as a function of
             observations, actions and next observations, where it is one; else None.
+        symmetries: ``module:function`` of :class:`irlcli.symmetries.Symmetries` as a function of the
+            keyword arguments of settings, where there are any; else None.
         unobserved: what the true reward depends on besides them, as the end of a sentence, if known.
         needs: a library that may be missing.
         own: of an environment from outside the package; its ``entry_point`` or ``gym_id`` is empty.
@@ -140,6 +142,7 @@ class EnvironmentSpec(NamedTuple):
     tabular: bool = False
     physics: int = 1
     transition_reward: str | None = None
+    symmetries: str | None = None
     unobserved: str | None = None
     needs: Needs | None = None
     own: Own | None = None

@@ -45,6 +45,7 @@ from irlcli.learners.discriminator import (
     penalty_weight_at,
 )
 from irlcli.learners.grouping import Group, Part, apportion, group
+from irlcli.learners.images import Images
 from irlcli.learners.mixing import mixed
 from irlcli.learners.pools import (
     Minibatch,
@@ -67,6 +68,7 @@ from irlcli.networks import all_finite
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
 from irlcli.penalties.risk import cross_entropy
 from irlcli.seeds import derive
+from irlcli.symmetries import Symmetries
 from irlcli.trajectories import (
     ActionSpace,
     Rollout,
@@ -93,6 +95,7 @@ class AIRL:
         observation_size: D.
         actions: the environment's actions.
         seed: initialisation and every minibatch derive from it.
+        symmetries: of the environment; None: samples are used as they are.
 
     Raises:
         ValueError: the demonstrations have other observations or actions than the environment.
@@ -108,8 +111,10 @@ class AIRL:
         observation_size: int,
         actions: ActionSpace,
         seed: int,
+        symmetries: Symmetries | None = None,
     ):
         self.config = config
+        self._images = Images(symmetries)
         self.view = ActionView(config.actions, actions)
         self._rounds = rounds
         self._horizon = horizon
@@ -166,7 +171,7 @@ class AIRL:
         # demonstrations.
         self.scale = 1.0
         for episodes in self._demonstrations:
-            self.model.normaliser.update(torch.as_tensor(join(episodes).observations))
+            self._normalise([join(episodes).observations], -1)
 
     def begin(self, trainer: Any) -> None:
         """Before the first round: let the student begin as a clone, if the config asks for it.
@@ -233,9 +238,7 @@ class AIRL:
             config.penalty_ramp_rounds,
         )
         generated, challenged = self._generated(rollouts), self._generated(challenge)
-        self.model.normaliser.update(
-            torch.as_tensor(np.concatenate([d.observations for d, _ in (*generated, *challenged)]))
-        )
+        self._normalise([d.observations for d, _ in (*generated, *challenged)], index)
         current = [self._pool(data, policy) for data, _ in generated]
         expert = [self._pool(join(episodes), policy) for episodes in self._demonstrations]
         risks = self._risks(current, self._replay, expert, policy)
@@ -267,6 +270,16 @@ class AIRL:
             for diagnostics in self._diagnostics(current, expert, generator)
         ]
 
+    def _normalise(self, observations: Sequence[np.ndarray], index: int) -> None:
+        """Add images of ``observations`` to the moments of the model's input."""
+        generator = torch.Generator().manual_seed(derive("images", self._seed, index)[0])
+        added = torch.as_tensor(np.concatenate(observations))
+        self.model.normaliser.update(self._images.of_observations(added, generator))
+
+    def _sampled(self, risks: Sequence[Sequence[Stratum]], generator: torch.Generator) -> Minibatch:
+        batch = sample_minibatch(risks, generator, self.config.replay_share)
+        return self._images.of(batch, generator)
+
     def _optimise(
         self,
         index: int,
@@ -289,10 +302,10 @@ class AIRL:
             # For dropout, which takes no generator.
             torch.manual_seed(derive("dropout", self._seed, index)[0])
             for _ in range(config.updates_per_round):
-                batch = sample_minibatch(risks, generator, config.replay_share)
+                batch = self._sampled(risks, generator)
                 challenger = None
                 if challenger_risks is not None:
-                    challenger = sample_minibatch(challenger_risks, generator, config.replay_share)
+                    challenger = self._sampled(challenger_risks, generator)
                     if config.challenger.mixed_share:
                         challenger = mixed(challenger, config.challenger.mixed_share, generator)
                 loss = self._loss(batch, challenger, weight, generator)

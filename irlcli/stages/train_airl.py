@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from irlcli.learners.selection import BestRound
     from irlcli.rl.loop import LastRound
     from irlcli.rl.worlds import Worlds
+    from irlcli.symmetries import Symmetries
     from irlcli.trajectories import Trajectory
 
 
@@ -83,6 +84,8 @@ def request(
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
     relevant = relevant_airl(airl, environment(env).discrete_actions)
+    if relevant.symmetries is True and environment(env).symmetries is None:
+        raise UsageError(f"airl.symmetries: {env} has none", "omit airl.symmetries")
     _check_rounds(relevant)
     if trained == 1:
         relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))
@@ -290,9 +293,24 @@ def _learner(
             observation_size=size,
             actions=action_space(worlds.action_space),
             seed=p.seed,
+            symmetries=_symmetries(p, settings),
         )
     except ValueError as error:
         raise IntegrityError(f"{env}: {error}") from None
+
+
+def _symmetries(p: Parameters, settings: Sequence[str]) -> Symmetries | None:
+    from irlcli.envs.registration import symmetries
+
+    if p.airl.symmetries is not True:
+        return None
+    env = p.environment.name
+    found = symmetries(env, [parse_setting(env, text) for text in settings])
+    if len(found.actions) == 1:
+        raise UsageError(
+            f"airl.symmetries: {env} has none in {', '.join(settings)}", "omit airl.symmetries"
+        )
+    return found
 
 
 def _selector(

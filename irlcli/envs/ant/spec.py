@@ -12,6 +12,7 @@ SPEC = EnvironmentSpec(
         **WALKER_KNOBS,
         "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
     },
+    symmetries="irlcli.envs.ant.symmetries:symmetries",
     needs=PYBULLET,
     unobserved="the positions of its parts one substep ago",
 )
