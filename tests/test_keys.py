@@ -268,8 +268,9 @@ UNREAD = {
     "control-maps": [f"control.maps.{n}" for n in ("settings", "spread", "gaps", "choices")],
 }
 # Challengers need logits without log pi. A mean of rounds has no best round, nor has a training that
-# may end early.
+# may end early. The reacher has no symmetries.
 REFUSED = ["airl.ppo.use_sde", "airl.logit", "airl.averaged_rounds", "airl.plateau_rounds"]
+REFUSED += ["airl.symmetries"]
 # Beside gSDE.
 REFUSED += [f"{part}.ppo.log_std_max" for part in ("expert", "transfer", "airl.challenger")]
 # Fields whose type does not tell another valid value.
@@ -284,6 +285,7 @@ CHANGED = {
     "airl.averaged_rounds": 3,
     "airl.averaged_by": "learning-rate",
     "airl.plateau_rounds": 3,
+    "airl.symmetries": True,
     "airl.challenger.mixed_share": 0.5,
     "airl.challenger.per_setting": True,
     "transfer.algorithm": "other",
@@ -512,6 +514,17 @@ def test_no_dropout_is_in_no_key():
 def test_all_columns_are_in_no_key():
     none, last = (with_field(in_use(), "airl.columns", columns) for columns in ((), (-1,)))
     assert key(airl(none)) == key(airl(in_use())) != key(airl(last))
+
+
+def test_no_symmetries_are_in_no_key():
+    settings = parse_settings("ant", "friction=1.5:0.1:0.1,2:0.6:0.6")
+
+    def of_the_ant(config):
+        learned = replace(config.airl, select="last")
+        return key(train_airl.request(From(demos(config)), "ant", settings, learned))
+
+    none, some = (with_field(in_use(), "airl.symmetries", value) for value in (False, True))
+    assert of_the_ant(none) == of_the_ant(in_use()) != of_the_ant(some)
 
 
 def test_the_last_round_alone_is_in_no_key():

@@ -88,6 +88,31 @@ def test_walkers_go_through_the_chain(tmp_path, irl, env, intervention, ood):
             assert "RUN" not in done.err
 
 
+def test_a_reward_learned_with_symmetries(tmp_path, irl):
+    """Only the discriminator's samples change: the Ant's four turns with a goal, none with its legs too."""
+    small = [f"{section}.ppo.n_steps=64" for section in ("expert", "airl")]
+    small += [f"{section}.total_steps=256" for section in ("expert", "airl")]
+    common = ["--store", tmp_path, "--profile", "smoke", "--quiet"]
+    common += [word for item in small for word in ("--set", item)]
+    parts = ["--set", "airl.logit=f", "--set", "airl.symmetries=true"]
+    train = ["train-airl", "--demos", "demos", "--method", "erm"]
+    goal = ["collect-experts", "--env", "ant", "--intervention", "goal-y", "--name", "demos"]
+    assert irl(*goal, *common).code == 0
+    for words in ([], parts[:2], parts):
+        done = irl(*train, *common, *words)
+        assert done.code == 0, done.err
+    rewards = [a for a in Store(tmp_path).artefacts() if a.manifest.record.stage == "train-airl"]
+    assert len(rewards) == 3
+    assert len({(a.directory / "reward.pt").read_bytes() for a in rewards}) == 3
+    done = irl(*train, *common, *parts[2:])
+    assert done.code == 2 and "airl.symmetries needs logits without log pi" in done.err
+    both = ["--setting", "goal-y=0,leg-length=2x", "--setting", "goal-y=-900,leg-length=2x"]
+    done = irl("collect-experts", "--env", "ant", *both, *common, "--name", "demos")
+    assert done.code == 0, done.err
+    done = irl(*train, *common, *parts)
+    assert done.code == 2 and "ant has none in goal-y=0,leg-length=2x" in done.err
+
+
 def test_play_draws_the_settings_side_by_side(chains, irl, tmp_path):
     file = tmp_path / "moved.gif"
     arguments = ["play", "moved", "--store", chains / "1", "--ood", "2x,0.5x", "--steps", "12"]
@@ -125,6 +150,13 @@ def test_play_refuses_a_damaged_policy(chains, irl, tmp_path):
         (
             ["train-airl", "--demos", "demos", "--set", "airl.ppo.use_sde=true"],
             "gSDE's noise lasts several steps",
+        ),
+        (
+            [
+                *("train-airl", "--demos", "demos", "--set", "airl.symmetries=true"),
+                *("--set", "airl.logit=f", "--profile", "smoke"),
+            ],
+            "airl.symmetries: reacher has none",
         ),
         (
             [

@@ -28,6 +28,11 @@ def test_labels_tell_kinds_of_challengers_apart():
         assert label.endswith(ending)
 
 
+def test_labels_tell_rewards_learned_with_symmetries_apart():
+    assert labels.learned({"symmetries": True}) == "with symmetries"
+    assert labels.learned({"symmetries": False}) == ""
+
+
 def test_labels_tell_means_of_rounds_apart():
     averaged = {"averaged_rounds": 30}
     last, equal, weighted = (
