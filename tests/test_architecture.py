@@ -21,7 +21,7 @@ FILES = {
 LAYERS = [
     ["errors", "seeds"],
     ["envs.spec", "envs.registry"],
-    ["interventions", "methods", "trajectories", "tabular", "networks"],
+    ["interventions", "methods", "trajectories", "symmetries", "tabular", "networks"],
     ["penalties", "learners.__init__", "rl.__init__"],
     ["configs"],
     ["store", "labels", "data.descriptions"],
@@ -46,6 +46,7 @@ NEVER = {
     "configs": HEAVY | {"numpy"},
     "interventions": HEAVY | {"numpy", "msgspec", "pathlib"},
     "trajectories": (HEAVY | {"msgspec", "pathlib", "irlcli"}),
+    "symmetries": HEAVY | {"msgspec", "pathlib", "irlcli"},
     "tabular": (HEAVY - {"scipy"}) | {"pathlib", "irlcli"},
     "store": HEAVY | {"numpy", "msgspec"},
     "envs": {"torch", "stable_baselines3", "pandas", "pyarrow", "irlcli.store", "irlcli.learners"},
