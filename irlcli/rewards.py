@@ -61,12 +61,11 @@ class LearnedReward:
         Raises:
             ValueError: arrays of other shapes, or indices of no action.
         """
-        from irlcli.trajectories import Transitions
+        from irlcli.trajectories import ActionSpace, Transitions
 
-        kind: type = np.float32
-        action: tuple[int, ...] = (self.action_size,)
-        if self.discrete:
-            kind, action = np.int64, (len(self.choices),) if self.choices else ()
+        none = np.empty(0)
+        space = ActionSpace(self.discrete, self.action_size, none, none, self.choices)
+        kind = np.int64 if self.discrete else np.float32
         observations = np.ascontiguousarray(obs, dtype=np.float32)
         size = len(observations)
         data = Transitions(
@@ -78,18 +77,16 @@ class LearnedReward:
         )
         wanted = {
             "obs": (data.observations, (size, self.observation_size)),
-            "act": (data.actions, (size, *action)),
+            "act": (data.actions, (size, *space.shape)),
             "next_obs": (data.next_observations, (size, self.observation_size)),
             "done": (data.terminated, (size,)),
         }
         for name, (array, shape) in wanted.items():
             if array.shape != shape:
                 raise ValueError(f"{name} is {list(array.shape)}, not {list(shape)}")
-        if self.discrete:
-            counts = np.array(self.choices or self.action_size)
-            if ((data.actions < 0) | (data.actions >= counts)).any():
-                last = ", ".join(map(str, np.ravel(counts - 1)))
-                raise ValueError(f"act has indices below 0 or above {last}")
+        if self.discrete and space.outside(data.actions).any():
+            last = ", ".join(map(str, np.ravel(space.last)))
+            raise ValueError(f"act has indices below 0 or above {last}")
         return self._frozen.of_steps(data)
 
     def module(self) -> StandaloneReward:

@@ -223,3 +223,12 @@ class ActionSpace(NamedTuple):
         if self.discrete:
             return (len(self.choices),) if self.choices else ()
         return (self.size,)
+
+    @property
+    def last(self) -> np.ndarray:
+        """The largest index [], or [K] of several; indices start at 0."""
+        return np.array(self.choices or self.size) - 1
+
+    def outside(self, actions: np.ndarray, start: int | np.ndarray = 0) -> np.ndarray:
+        """Which indices among ``actions`` [B] or [B, K] are no choice, if the first is ``start``."""
+        return (actions < start) | (actions > start + self.last)

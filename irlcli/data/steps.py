@@ -253,10 +253,9 @@ class Check:
                 )
         found, wanted = steps.actions, self.actions
         fits = found.shape == (len(steps), *wanted.shape)
-        counts = np.array(wanted.choices or wanted.size)
         if wanted.discrete:
             several = f"{len(wanted.choices)} " if wanted.choices else ""
-            last = _listed(self.start + counts - 1)
+            last = _listed(self.start + wanted.last)
             listed = f"{several}whole numbers from {_listed(self.start)} to {last}"
         else:
             listed = f"vectors of {wanted.size}"
@@ -269,7 +268,7 @@ class Check:
                 "check --env",
             )
         if wanted.discrete:
-            outside = (found < self.start) | (found >= self.start + counts)
+            outside = wanted.outside(found, self.start)
             bad = np.any(np.reshape(outside, (len(steps), -1)), axis=1)
             _refuse(steps, bad, f"action is not one of the {listed}", "check --env")
 

@@ -67,7 +67,11 @@ class ActionView:
 
 
 def check_fit(data: Transitions, observation_size: int, space: ActionSpace) -> None:
-    """Check that demonstrations ``data`` are of an environment with these observations and actions.
+    """Check that demonstrations are of an environment with these observations and actions.
+
+    Args:
+        data: as recorded. Clipping them first would broadcast actions of another size.
+        observation_size, space: of the environment.
 
     Raises:
         ValueError: they are not.
@@ -84,6 +88,12 @@ def check_fit(data: Transitions, observation_size: int, space: ActionSpace) -> N
             f"the demonstrations have actions of shape {list(shape)} and type "
             f"{data.actions.dtype}, the environment has {'int64' if space.discrete else 'float32'} "
             f"of shape {list(space.shape)}"
+        )
+    if space.discrete and space.outside(data.actions).any():
+        last = ", ".join(map(str, np.ravel(space.last)))
+        raise ValueError(
+            f"the demonstrations have actions below 0 or above {last}, which the environment does not "
+            "have"
         )
 
 

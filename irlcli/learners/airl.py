@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,8 @@ class AIRL:
         symmetries: of the environment; None: samples are used as they are.
 
     Raises:
-        ValueError: the demonstrations have other observations or actions than the environment.
+        ValueError: the demonstrations have other observations or actions than the environment, or
+            one is longer than its time limit.
     """
 
     def __init__(
@@ -121,11 +123,10 @@ class AIRL:
         self._seed = seed
         self._settings = len(demonstrations)
         self._world_settings = world_settings(worlds, self._settings)
-        self._demonstrations = [
-            [self.view.of(transitions([episode], horizon)) for episode in episodes]
-            for episodes in demonstrations
-        ]
-        check_fit(self._demonstrations[0][0], observation_size, actions)
+        recorded = [[transitions([t], horizon) for t in episodes] for episodes in demonstrations]
+        for data in chain(*recorded):
+            check_fit(data, observation_size, actions)
+        self._demonstrations = [[self.view.of(data) for data in episodes] for episodes in recorded]
         rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
         counts = [len(episodes) for episodes in demonstrations]
         self._groups = group(config.grouping, counts, rng)

@@ -98,12 +98,12 @@ def run(job: Job) -> None:
         space = action_space(worlds.action_space)
         size = observation_size(worlds.observation_space)
         view = ActionView(p.actions, space)
-        data = view.of(transitions(episodes, p.environment.max_episode_steps))
         try:
+            data = transitions(episodes, p.environment.max_episode_steps)
             check_fit(data, size, space)
         except ValueError as error:
             raise IntegrityError(f"{env} {setting}: {error}") from None
-        clone(trainer, data, view, p.clone.epochs, p.seed)
+        clone(trainer, view.of(data), view, p.clone.epochs, p.seed)
     write_policy(
         job.output,
         trainer.policy,

@@ -193,7 +193,7 @@ def run(job: Job) -> None:
         trainer = PPOTrainer(
             worlds, airl.ppo, airl.total_steps, p.seed, STAGE.name, keep_moments=airl.bc_epochs > 0
         )
-        learner = _learner(p, settings, episodes, worlds, trainer.rounds)
+        learner = _learner(p, settings, episodes, held_out, worlds, trainer.rounds)
         selector = _selector(p, learner, held_out, trainer.rounds)
         challengers = None
         if airl.challenger.life > 0:
@@ -267,12 +267,15 @@ def _learner(
     p: Parameters,
     settings: Sequence[str],
     episodes: Sequence[Sequence[Trajectory]],
+    held_out: Sequence[Sequence[Trajectory]],
     worlds: Worlds,
     rounds: int,
 ) -> AIRL:
-    """The learner of ``p``, before its first round."""
+    """The learner of ``p``, before its first round. What is held out is checked, too."""
     from irlcli.learners import learner
+    from irlcli.learners.actions import check_fit
     from irlcli.rl.worlds import action_space, observation_size
+    from irlcli.trajectories import transitions
 
     env, airl = p.environment.name, p.airl
     size = observation_size(worlds.observation_space)
@@ -283,15 +286,18 @@ def _learner(
             f"{settings[0]}",
             f"name some of {-size} to {size - 1}",
         )
+    actions, horizon = action_space(worlds.action_space), p.environment.max_episode_steps
     try:
+        for group in held_out:
+            check_fit(transitions(group, horizon), size, actions)
         return learner(airl.learner)(
             episodes,
             airl,
             worlds=len(worlds),
             rounds=rounds,
-            horizon=p.environment.max_episode_steps,
+            horizon=horizon,
             observation_size=size,
-            actions=action_space(worlds.action_space),
+            actions=actions,
             seed=p.seed,
             symmetries=_symmetries(p, settings),
         )

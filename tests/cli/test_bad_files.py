@@ -12,6 +12,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -19,9 +20,13 @@ from answers import IRL, Done, arguments, assert_answered, halve, snapshot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
+from irlcli.envs.registry import environment
 from irlcli.errors import IrlError
 from irlcli.experiments import provenance
+from irlcli.interventions import parse_setting
 from irlcli.store import Store
+from irlcli.trajectories import Trajectory
 
 
 def torch_zip(path: Path, pickled: bytes, extra: dict[str, bytes] | None = None) -> Path:
@@ -403,6 +408,28 @@ def deep_metadata(directory: Path) -> None:
     pq.write_table(table.replace_schema_metadata({b"irlcli": b"[" * 100_000}), path)
 
 
+def unknown_action(table: pa.Table) -> pa.Table:
+    """The last action of the last setting is the fifth of four."""
+    actions = [*table["action"].to_pylist()[:-1], 4]
+    index = table.schema.get_field_index("action")
+    return table.set_column(index, table.schema.field(index), pa.array(actions))
+
+
+def beyond_the_time_limit(directory: Path) -> None:
+    demos = read_demonstrations(directory)
+    steps = environment(demos.env).max_episode_steps + 1
+    long = Trajectory(
+        observations=np.zeros((steps + 1, 8), np.float32),
+        actions=np.zeros(steps, np.int64),
+        rewards=np.zeros(steps),
+        terminated=True,
+        truncated=False,
+        seed=0,
+    )
+    groups = [(parse_setting(demos.env, text), [long] * 2) for text in demos.trajectories]
+    write_demonstrations(directory, demos.env, groups, demos.metadata)
+
+
 SPOILED = {
     "no steps": lambda d: (d / "steps.parquet").unlink(),
     "no episodes": lambda d: (d / "episodes.parquet").unlink(),
@@ -437,6 +464,21 @@ def test_spoiled_foreign_demonstrations(irl, store_copy, foreign_demos, kind):
     SPOILED[kind](foreign_demos)
     result = irl(*arguments(f"train-airl --demos {foreign_demos} --seed 5", store_copy.path))
     assert_answered(result, 4, "foreign")
+
+
+@pytest.mark.parametrize("line", ["train-airl", "train-airl --select episodes", "assess airl"])
+@pytest.mark.parametrize(
+    "spoil, named",
+    [
+        (lambda d: rewrite_steps(d, unknown_action), "actions below 0 or above 3"),
+        (beyond_the_time_limit, "1001 steps exceeds the horizon of 1000"),
+    ],
+)
+def test_demonstrations_that_do_not_fit(irl, store_copy, foreign_demos, line, spoil, named):
+    """They are learned from, held out to select by, and cloned."""
+    spoil(foreign_demos)
+    result = irl(*arguments(f"{line} --demos {foreign_demos}", store_copy.path))
+    assert_answered(result, 4, named)
 
 
 def test_sound_foreign_demonstrations(irl, store_copy, foreign_demos):

@@ -85,6 +85,12 @@ def test_likelihoods_of_held_out_episodes_are_of_the_same_actions(demos):
     assert one == other
 
 
+def test_executed_actions_of_another_size_are_named(demos):
+    wider = [[replace(t, actions=np.repeat(t.actions, 3, axis=1)) for t in g] for g in demos]
+    with pytest.raises(ValueError, match=r"demonstrations have actions of shape \[6\]"):
+        make(wider, CONFIG, REACHER, SETTINGS, actions="executed")
+
+
 def test_discrete_actions_have_no_bounds():
     with pytest.raises(UsageError, match=r"airl\.actions = executed needs continuous actions"):
         relevant_airl(AIRLConfig(actions="executed"), discrete_actions=True)
