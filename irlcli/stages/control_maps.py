@@ -99,9 +99,14 @@ def _check(maps: CuedMapsConfig) -> None:
             )
 
 
+def _weights(maps: CuedMapsConfig) -> tuple[float, ...]:
+    """The lambdas, the smallest first."""
+    return tuple(sorted(maps.penalty_weights))
+
+
 def _strongest(maps: CuedMapsConfig, penalty: str) -> Variant:
     """``penalty`` at the largest lambda."""
-    return Variant(penalty=penalty, penalty_weight=max(maps.penalty_weights))
+    return Variant(penalty=penalty, penalty_weight=_weights(maps)[-1])
 
 
 def _few(maps: CuedMapsConfig) -> tuple[Variant, ...]:
@@ -118,7 +123,7 @@ def _sweeps(maps: CuedMapsConfig) -> Iterator[Case]:
         )
     }
     for penalty in ("irmv1", "irmv1-full", "closed-form", "vrex", "group-dro"):
-        weights = maps.penalty_weights
+        weights = _weights(maps)
         if penalty == "group-dro":
             weights = PENALTIES[penalty].candidates
         true = tuple(Variant(penalty=penalty, penalty_weight=w) for w in weights)
@@ -137,10 +142,11 @@ def _sweeps(maps: CuedMapsConfig) -> Iterator[Case]:
 
 def _without_warmup(maps: CuedMapsConfig) -> Iterator[Case]:
     """The smallest and the largest lambda from the start."""
+    weights = _weights(maps)
     cold = tuple(
         Variant(penalty=penalty, penalty_weight=weight, warm=False)
         for penalty in ("irmv1", "vrex")
-        for weight in sorted({maps.penalty_weights[0], max(maps.penalty_weights)})
+        for weight in sorted({weights[0], weights[-1]})
     )
     for features in _FEATURES:
         yield Case(
@@ -177,8 +183,7 @@ def _gaps(maps: CuedMapsConfig) -> Iterator[Case]:
 
 def _choices(maps: CuedMapsConfig) -> Iterator[Case]:
     """lambda chosen by leaving each setting out in turn."""
-    weights = tuple(sorted(maps.penalty_weights))
-    offered = tuple(Variant(penalty="irmv1-full", penalty_weight=w) for w in weights)
+    offered = tuple(Variant(penalty="irmv1-full", penalty_weight=w) for w in _weights(maps))
     for number, strengths in enumerate(maps.choices):
         yield Case(
             name=f"choice.{number + 1}",

@@ -5,6 +5,7 @@ import json
 
 import pyarrow.parquet as pq
 import pytest
+from msgspec.structs import replace
 
 from irlcli.configs import load_config
 from irlcli.errors import UsageError
@@ -58,6 +59,12 @@ def test_listings_tell_the_parts_apart(irl, store):
 def test_a_report_needs_every_part(irl, tmp_path):
     done = irl("report", "control", "--profile", "smoke", "--store", tmp_path / "empty")
     assert done.code == 3 and "lacks 9 of 9 steps" in done.err
+
+
+def test_the_order_of_the_lambdas_does_not_matter():
+    lambdas = (1.0, 10.0, 100.0)
+    rising, falling = (replace(SMOKE.maps, penalty_weights=w) for w in (lambdas, lambdas[::-1]))
+    assert list(control_maps.cases(rising)) == list(control_maps.cases(falling))
 
 
 @pytest.mark.parametrize(
