@@ -96,7 +96,7 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
     if not ppo.net_arch:
         ppo = replace(ppo, activation=_PPO.activation)
     # A minibatch is at most the whole rollout.
-    return replace(ppo, batch_size=min(ppo.batch_size, max(2, ppo.n_envs * ppo.n_steps)))
+    return replace(ppo, batch_size=min(ppo.batch_size, ppo.n_envs * ppo.n_steps))
 
 
 def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:

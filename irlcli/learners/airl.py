@@ -362,7 +362,7 @@ class AIRL:
         """The discriminator's learning rate in round ``index``."""
         if self.config.learning_rate_schedule == "constant":
             return self.config.learning_rate
-        return self.config.learning_rate * max(0.0, 1.0 - index / self._rounds)
+        return self.config.learning_rate * (1.0 - index / self._rounds)
 
     def _generated(self, rollouts: Sequence[Rollout]) -> list[tuple[Transitions, np.ndarray]]:
         """Each setting's transitions of this round, and the numbers of their episodes."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from irlcli.envs.registry import environment
-from irlcli.errors import UsageError
 from irlcli.interventions import parse_setting
 from irlcli.stages.base import (
     EnvironmentKey,
@@ -66,17 +65,8 @@ def request(
 
     Outputs ``assessment.json``, ``bank.parquet`` (a row per episode), ``scatter.png`` and
     ``scatter.svg``.
-
-    Raises:
-        UsageError: the bank has fewer than two policies in a setting.
     """
     places = list(dict.fromkeys(entry.setting for entry in bank))
-    for place in places:
-        if sum(entry.setting == place for entry in bank) < 2:
-            raise UsageError(
-                f"the bank has one policy in {place}, so no correlation is defined",
-                "a bank needs two policies or more",
-            )
     settings = [parse_setting(env, place) for place in places]
     parameters = Parameters(environment=environment_key(env, settings), bank=tuple(bank))
     inputs: dict[str, Source | From] = {"reward": reward}

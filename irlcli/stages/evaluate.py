@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 
 from irlcli.configs import EvaluationConfig
-from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.stages.base import (
     EnvironmentKey,
@@ -62,14 +61,9 @@ def request(
     row per episode) and ``summary.json``.
 
     Raises:
-        UsageError: a tabular environment, or a policy missing or too many.
+        UsageError: a tabular environment.
     """
     check_tabular(env, "evaluate", wanted=False)
-    if (agent == "policy") != (policy is not None):
-        raise UsageError(
-            f"agent {agent!r} {'needs a' if policy is None else 'takes no'} policy",
-            "give a policy, or name the random or the idle agent",
-        )
     texts = tuple(str(s) for s in settings)
     parameters = Parameters(
         environment=environment_key(env, settings),

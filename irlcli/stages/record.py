@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from irlcli.configs import EvaluationConfig
-from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.stages import evaluate
 from irlcli.stages.base import (
@@ -58,13 +57,9 @@ def request(
     Outputs ``steps.parquet``, ``episodes.parquet`` and ``summary.json``.
 
     Raises:
-        UsageError: a tabular environment, a policy missing or too many, or noise on no policy.
+        UsageError: a tabular environment.
     """
     check_tabular(env, "record", wanted=False)
-    if (agent == "policy") != (policy is not None) or (noise and agent != "policy"):
-        raise UsageError(
-            f"agent {agent!r} does not fit its policy or noise", "noise needs a policy"
-        )
     parameters = Parameters(
         environment=environment_key(env, [setting]),
         setting=str(setting),

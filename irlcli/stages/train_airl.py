@@ -255,10 +255,9 @@ def _episodes(
         except ValueError as error:
             raise UsageError(str(error), "select by a setting, or record more episodes") from None
         episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
-    if p.airl.grouping == "shuffled" and (len(settings) == 1 or max(map(len, episodes)) == 1):
+    if p.airl.grouping == "shuffled" and max(map(len, episodes)) == 1:
         job.console.warn(
-            "shuffling changes nothing with one setting or with one demonstration of each: this is "
-            "no control"
+            "shuffling changes nothing with one demonstration of each setting: this is no control"
         )
     return episodes, held_out
 

@@ -180,7 +180,7 @@ def _student(path: Path, config: Any) -> tuple[Policy, Any]:
             f"the policy to start from is of the agent {about.agent}, not a student",
             "name the policy.pt beside the reward",
         )
-    own = ("net_arch", "activation", "normalise_observations", "use_sde")
+    own = ("net_arch", "activation", "normalise_observations")
     return student, replace(config, **{name: getattr(about.network, name) for name in own})
 
 
