@@ -393,23 +393,23 @@ class AIRL:
         size = self.config.batch_size * self._settings // len(self._groups)
 
         def paired(pools: Sequence[Pool], part: Part) -> list[Pool]:
-            """The policy's pools that go with ``part``: of the same settings, or of all."""
+            """The policy's pools that go with ``part``: of the same setting, or of all."""
             if self.config.pairing == "pooled":
                 return list(pools)
-            return [pools[setting] for setting in part.episodes]
+            return [pools[part.setting]]
 
-        def demonstrated(setting: int, episodes: np.ndarray) -> Pool:
-            own = self._demonstrations[setting]
-            if len(episodes) == len(own):
-                return expert[setting]
-            return self._pool(join([own[i] for i in episodes]), policy)
+        def demonstrated(part: Part) -> Pool:
+            own = self._demonstrations[part.setting]
+            if len(part.episodes) == len(own):
+                return expert[part.setting]
+            return self._pool(join([own[i] for i in part.episodes]), policy)
 
         def strata(members: Group) -> list[Stratum]:
             counts = apportion(size, [part.share for part in members.parts])
             return [
                 Stratum(
                     policy=join_pools(paired(current, part)),
-                    expert=join_pools([demonstrated(e, i) for e, i in part.episodes.items()]),
+                    expert=demonstrated(part),
                     past=join_pools(paired(past, part)) if past else None,
                     count=count,
                 )

@@ -9,14 +9,16 @@ import numpy as np
 
 
 class Part(NamedTuple):
-    """Demonstrations of a risk that are drawn from together.
+    """A setting's demonstrations in a risk.
 
     Attributes:
-        episodes: by setting, the indices of its episodes.
+        setting: its index.
+        episodes: the indices of those of its episodes that belong to the risk.
         share: of the risk's samples.
     """
 
-    episodes: dict[int, np.ndarray]
+    setting: int
+    episodes: np.ndarray
     share: float
 
 
@@ -40,19 +42,18 @@ def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> lis
       the share of the total weight that it has in ``per-setting``, whatever its count.
     """
     settings = range(len(counts))
-    everything = {e: np.arange(counts[e]) for e in settings}
     if grouping == "pooled":
-        parts = (Part({e: everything[e]}, counts[e] / sum(counts)) for e in settings)
+        parts = (Part(e, np.arange(counts[e]), counts[e] / sum(counts)) for e in settings)
         return [Group(tuple(parts), 1.0)]
     if grouping in ("balanced", "per-setting"):
-        return [Group((Part({e: everything[e]}, 1.0),), 1.0 / len(counts)) for e in settings]
+        return [Group((Part(e, np.arange(counts[e]), 1.0),), 1.0 / len(counts)) for e in settings]
     dealt = deal(counts, rng)
     # Group g holds shares[g, e] of setting e, so that the columns sum to one.
     shares = np.array([[np.mean(dealt[e] == g) for e in settings] for g in settings])
     return [
         Group(
             tuple(
-                Part({e: np.flatnonzero(dealt[e] == g)}, shares[g, e] / shares[g].sum())
+                Part(e, np.flatnonzero(dealt[e] == g), shares[g, e] / shares[g].sum())
                 for e in settings
                 if shares[g, e] > 0.0
             ),

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from irlcli.learners.grouping import Group, Part, group
+from irlcli.learners.grouping import Group, group
 from irlcli.learners.occupancy import Demonstrations, mean_occupancy
 from irlcli.learners.soft_values import Solution, solve
 from irlcli.penalties import Occupancies, loss_divisor, occupancy_penalty
@@ -77,17 +77,15 @@ def group_risks(
     rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
     groups = group(grouping, demos.counts.tolist(), rng)
     if grouping == "balanced":
-        parts = [Part(p.episodes, g.weight * p.share) for g in groups for p in g.parts]
+        parts = [p._replace(share=g.weight * p.share) for g in groups for p in g.parts]
         groups = [Group(tuple(parts), 1.0)]
     occupancy, shares = np.zeros((len(groups), e, n)), np.zeros((len(groups), e))
     for k, risk in enumerate(groups):
         for part in risk.parts:
-            count = sum(map(len, part.episodes.values()))
-            for setting, episodes in part.episodes.items():
-                paths = [demos.states[setting][i] for i in episodes]
-                rho = mean_occupancy(settings.mdps[setting], paths, horizon)
-                occupancy[k, setting] = rho
-                shares[k, setting] = part.share * (len(paths) / count)
+            paths = [demos.states[part.setting][i] for i in part.episodes]
+            rho = mean_occupancy(settings.mdps[part.setting], paths, horizon)
+            occupancy[k, part.setting] = rho
+            shares[k, part.setting] = part.share
     return Risks(occupancy, shares, np.array([risk.weight for risk in groups]))
 
 

@@ -15,9 +15,7 @@ def setting_weights(groups, settings):
     found = np.zeros(settings)
     for g in groups:
         for part in g.parts:
-            for e in part.episodes:
-                counts = {s: len(rows) for s, rows in part.episodes.items()}
-                found[e] += g.weight * part.share * counts[e] / sum(counts.values())
+            found[part.setting] += g.weight * part.share
     return found
 
 
@@ -30,8 +28,8 @@ def test_pooled_demonstrations_weigh_by_count():
 @pytest.mark.parametrize("grouping", ["balanced", "per-setting"])
 def test_settings_have_groups_of_their_own_and_of_equal_weight(grouping):
     groups = group(grouping, [10, 3], np.random.default_rng(0))
-    assert [list(g.parts[0].episodes) for g in groups] == [[0], [1]]
-    assert [len(g.parts[0].episodes[e]) for e, g in enumerate(groups)] == [10, 3]
+    parts = [part for (part,) in (g.parts for g in groups)]
+    assert [(part.setting, len(part.episodes)) for part in parts] == [(0, 10), (1, 3)]
     assert setting_weights(groups, 2).tolist() == [0.5, 0.5]
 
 
@@ -49,7 +47,7 @@ def test_shuffling_keeps_each_settings_weight(counts, seed):
 def test_shuffling_deals_out_every_episode_once(counts, seed):
     groups = group("shuffled", counts, np.random.default_rng(seed))
     for e, count in enumerate(counts):
-        parts = [p.episodes[e] for g in groups for p in g.parts if e in p.episodes]
+        parts = [p.episodes for g in groups for p in g.parts if p.setting == e]
         assert sorted(np.concatenate(parts)) == list(range(count))
 
 
