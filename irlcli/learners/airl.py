@@ -59,11 +59,11 @@ from irlcli.learners.pools import (
 from irlcli.learners.replay import Replay, whole_episodes
 from irlcli.learners.reward_model import AveragedReward, RewardModel, RewardModule
 from irlcli.learners.scoring import (
-    bounded_reward,
     level_of,
     policy_reward,
     reward_quantiles,
     reward_scale,
+    transformed_reward,
 )
 from irlcli.networks import all_finite
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
@@ -203,10 +203,11 @@ class AIRL:
     def challenger_rewards(self, rollout: Rollout) -> np.ndarray:
         """The rewards [T, N] of a challenger: the current g, bounded as in ``ChallengerConfig``."""
         data = self.view.of(rollout.transitions(slice(None), self._horizon))
-        reward = bounded_reward(
+        ceiling = level_of(self._quantiles_of(self.model), self.config.challenger.ceiling)
+        reward = transformed_reward(
             self.model,
             data,
-            level_of(self._quantiles_of(self.model), self.config.challenger.ceiling),
+            lambda g: g.clamp(max=ceiling),
             self.config.fixed_horizon,
             self.config.challenger.ppo.gamma,
         )

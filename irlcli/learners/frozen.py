@@ -12,7 +12,7 @@ from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
 from irlcli.learners.actions import ActionView, Policy
 from irlcli.learners.reward_model import RewardModule
-from irlcli.learners.scoring import bounded_reward, episode_reward, level_of
+from irlcli.learners.scoring import episode_reward, level_of, transformed_reward
 from irlcli.learners.standalone import StandaloneReward
 from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
 
@@ -76,7 +76,13 @@ class FrozenReward:
     def of_steps(self, data: Transitions) -> np.ndarray:
         """The reward [B] float32 of each step of ``data``, as :meth:`rewards` gives it."""
         seen = self._view.of(data)
-        reward = bounded_reward(self._model, seen, self._ceiling, self._absorbing, self._gamma)
+        reward = transformed_reward(
+            self._model,
+            seen,
+            lambda g: g.clamp(max=self._ceiling),
+            self._absorbing,
+            self._gamma,
+        )
         return (reward / self._scale).numpy()
 
     def standalone(self) -> StandaloneReward:

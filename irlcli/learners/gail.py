@@ -11,10 +11,11 @@ frozen and retrained on is the last g, as for every learner.
 from __future__ import annotations
 
 import numpy as np
+from torch.nn.functional import softplus
 
 from irlcli.learners.actions import Policy
 from irlcli.learners.airl import AIRL
-from irlcli.learners.scoring import imitation_reward
+from irlcli.learners.scoring import transformed_reward
 from irlcli.trajectories import Rollout
 
 
@@ -26,9 +27,11 @@ class GAIL(AIRL):
 
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The rewards [T, N] of ``policy`` for its rollout, by the current discriminator."""
-        reward = imitation_reward(
+        # -log(1 - D) = softplus(g).
+        reward = transformed_reward(
             self.model,
             self.view.of(rollout.transitions(slice(None), self._horizon)),
+            softplus,
             self.config.fixed_horizon,
             self.config.ppo.gamma,
         )

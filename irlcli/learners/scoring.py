@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from torch.nn.functional import softplus
 
 from irlcli.learners.pools import Pool, make_pool
 from irlcli.learners.reward_model import RewardModel, RewardModule
@@ -52,40 +51,27 @@ def policy_reward(
         return reward
 
 
-def imitation_reward(
-    model: RewardModel, data: Transitions, absorbing: bool, gamma: float
+def transformed_reward(
+    model: RewardModule,
+    data: Transitions,
+    transform: Callable[[torch.Tensor], torch.Tensor],
+    absorbing: bool,
+    gamma: float,
 ) -> torch.Tensor:
-    """-log(1 - D) = softplus(g) of each transition [B] float32, without gradient.
+    """``transform`` of g [B], for each transition [B] float32, without gradient.
 
     With ``absorbing``, a terminated transition also earns the discounted sum of its absorbing
-    state's rewards: without it a reward that is never negative favours staying alive.
+    state's rewards, gamma / (1 - gamma) times the transformed g there: without it a reward that is
+    never negative favours staying alive.
     """
     with torch.no_grad():
         actions = model.encode(torch.as_tensor(data.actions))
-        reward = softplus(model.reward(torch.as_tensor(data.observations), actions))
-        terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
-        if absorbing and bool(terminated.any()):
-            g, _ = model.absorbing_reward(torch.as_tensor(data.next_observations))
-            reward = reward + absorbing_value(softplus(g), terminated, gamma)
-        return reward
-
-
-def bounded_reward(
-    model: RewardModule, data: Transitions, ceiling: float, absorbing: bool, gamma: float
-) -> torch.Tensor:
-    """min(g, ``ceiling``) of each transition [B] float32, without gradient.
-
-    With ``absorbing``, a terminated transition also earns the discounted sum of its absorbing
-    state's rewards, gamma / (1 - gamma) times the bounded reward there.
-    """
-    with torch.no_grad():
-        actions = model.encode(torch.as_tensor(data.actions))
-        reward = model.reward(torch.as_tensor(data.observations), actions).clamp(max=ceiling)
+        reward = transform(model.reward(torch.as_tensor(data.observations), actions))
         terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
         if absorbing and bool(terminated.any()):
             final = torch.as_tensor(data.next_observations)
-            g = model.reward(final, torch.zeros(len(final), model.action_size)).clamp(max=ceiling)
-            reward = reward + absorbing_value(g, terminated, gamma)
+            g = model.reward(final, torch.zeros(len(final), model.action_size))
+            reward = reward + absorbing_value(transform(g), terminated, gamma)
         return reward
 
 

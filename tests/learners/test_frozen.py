@@ -21,7 +21,7 @@ from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
 from irlcli.learners.pools import make_pool
 from irlcli.learners.reward_model import RewardModel, build
-from irlcli.learners.scoring import bounded_reward, reward_quantiles
+from irlcli.learners.scoring import reward_quantiles, transformed_reward
 from irlcli.rl.rollout import roll_out
 from irlcli.trajectories import ActionSpace, Trajectory, Transitions
 
@@ -230,7 +230,8 @@ def bounded(network, ceiling, absorbing, terminated):
         terminated=np.array([False, terminated]),
         remaining=np.array([0, 5 * terminated]),
     )
-    return bounded_reward(model, data, ceiling, absorbing, gamma=0.9).tolist()
+    bounded = transformed_reward(model, data, lambda g: g.clamp(max=ceiling), absorbing, 0.9)
+    return bounded.tolist()
 
 
 @pytest.mark.parametrize(

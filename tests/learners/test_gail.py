@@ -3,10 +3,11 @@
 import numpy as np
 import torch
 from airl_runs import make, random_episodes
+from torch.nn.functional import softplus
 
 from irlcli.learners.gail import GAIL
 from irlcli.learners.reward_model import RewardModel
-from irlcli.learners.scoring import imitation_reward
+from irlcli.learners.scoring import transformed_reward
 from irlcli.trajectories import Transitions
 
 PLAIN = {"kind": GAIL, "logit": "f", "shaping": False, "policy_reward": "f"}
@@ -29,7 +30,7 @@ def test_the_reward_is_minus_the_logarithm_of_what_the_discriminator_gives_the_p
     with torch.no_grad():
         g = model.reward(torch.ones(4, 3), torch.zeros(4, 2))
         expected = -torch.log(1.0 - g.sigmoid())
-    torch.testing.assert_close(imitation_reward(model, data, True, 0.9), expected)
+    torch.testing.assert_close(transformed_reward(model, data, softplus, True, 0.9), expected)
 
 
 def test_an_episode_that_ends_earns_the_series_of_its_absorbing_state():
@@ -39,9 +40,9 @@ def test_an_episode_that_ends_earns_the_series_of_its_absorbing_state():
         here = model.reward(torch.ones(4, 3), torch.zeros(4, 2))
         there = model.reward(torch.full((4, 3), 2.0), torch.zeros(4, 2))
     rewards = [-torch.log(1.0 - g.sigmoid()) for g in (here, there)]
-    found = imitation_reward(model, data, absorbing=True, gamma=0.9)
+    found = transformed_reward(model, data, softplus, absorbing=True, gamma=0.9)
     torch.testing.assert_close(found, rewards[0] + 9.0 * rewards[1])
-    torch.testing.assert_close(imitation_reward(model, data, False, 0.9), rewards[0])
+    torch.testing.assert_close(transformed_reward(model, data, softplus, False, 0.9), rewards[0])
 
 
 def test_a_student_earns_what_is_never_negative_and_does_not_depend_on_its_likelihood():
