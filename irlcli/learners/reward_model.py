@@ -74,13 +74,9 @@ class RewardModel(nn.Module):
         """Actions as vectors [B, A]: one-hot if discrete, those of several indices side by side."""
         if not self.discrete:
             return actions
-        indices = self.indices(actions)
-        return torch.cat([nn.functional.one_hot(*part) for part in indices], -1).float()
-
-    def indices(self, actions: torch.Tensor) -> list[tuple[torch.Tensor, int]]:
-        """Each index [B] of discrete ``actions`` [B] or [B, K], and its number of choices."""
-        parts = actions.unbind(-1) if self.several else (actions,)
-        return list(zip(parts, self.choices, strict=True))
+        parts = zip(actions.unbind(-1) if self.several else (actions,), self.choices, strict=True)
+        # one_hot() of any batch size cannot be exported: it looks at the largest index.
+        return torch.cat([part[..., None] == torch.arange(n) for part, n in parts], -1).float()
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """g [B] for observations [B, D] and encoded actions [B, A]."""
@@ -150,10 +146,6 @@ class AveragedReward(nn.Module):
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
         """As :meth:`RewardModel.encode`."""
         return self._models[0].encode(actions)
-
-    def indices(self, actions: torch.Tensor) -> list[tuple[torch.Tensor, int]]:
-        """As :meth:`RewardModel.indices`."""
-        return self._models[0].indices(actions)
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """The mean of g [B] for observations [B, D] and encoded actions [B, A]."""

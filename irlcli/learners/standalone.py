@@ -55,18 +55,12 @@ class StandaloneReward(nn.Module):
             actions: [B, A] float32, or [B] or [B, K] int64 indices.
             terminated: [B] bool; a time limit is no termination.
         """
-        reward = self.model.reward(observations, self._encoded(actions)).clamp(max=self._ceiling)
+        if self.low is not None and self.high is not None:
+            actions = actions.clamp(self.low, self.high)
+        vectors = self.model.encode(actions)
+        reward = self.model.reward(observations, vectors).clamp(max=self._ceiling)
         if self._absorbing:
             none = observations.new_zeros(observations.shape[0], self.model.action_size)
             final = self.model.reward(next_observations, none).clamp(max=self._ceiling)
             reward = reward + absorbing_value(final, terminated.float(), self._gamma)
         return reward / self._scale
-
-    def _encoded(self, actions: torch.Tensor) -> torch.Tensor:
-        if self.model.discrete:
-            # one_hot() of any batch size cannot be exported: it looks at the largest index.
-            indices = self.model.indices(actions)
-            return torch.cat([part[:, None] == torch.arange(n) for part, n in indices], -1).float()
-        if self.low is None or self.high is None:
-            return actions
-        return actions.clamp(self.low, self.high)
