@@ -1,4 +1,4 @@
-"""MaxEnt IRL on cued maps: rewards of many methods and maps side by side, and the weights of their hints."""
+"""MaxEnt IRL on cued maps: rewards of many methods and maps side by side."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from irlcli.controls import cued_maps
+from irlcli.configs.schema import CuedMapsConfig
 from irlcli.controls.cued_maps import (
     Judgement,
     Maps,
@@ -23,37 +23,6 @@ from irlcli.learners.occupancy import Demonstrations
 from irlcli.learners.soft_values import solve
 
 
-class World(NamedTuple):
-    """The maps and the experts.
-
-    Attributes:
-        size: cells a side.
-        horizon: H [steps].
-        value: of a good cell in the true reward, per step.
-        texture: share of the cells in which the texture tells the quality.
-        episodes: demonstrations per setting.
-        unseen: the colours' share in the unseen setting.
-        unseen_maps: maps of it per run.
-    """
-
-    size: int
-    horizon: int
-    value: float
-    texture: float
-    episodes: int
-    unseen: float
-    unseen_maps: int
-
-
-class Fit(NamedTuple):
-    """How a reward is fitted; ``hidden`` is 0 for a linear one."""
-
-    hidden: int
-    iterations: int
-    warmup: int
-    learning_rate: float
-
-
 class Dataset(NamedTuple):
     """What S runs learn from: maps of E settings with C colours, and demonstrations in them."""
 
@@ -62,12 +31,12 @@ class Dataset(NamedTuple):
     colours: int
 
 
-def dataset(world: World, strengths: np.ndarray, seeds: Sequence[int]) -> Dataset:
+def dataset(config: CuedMapsConfig, strengths: np.ndarray, seeds: Sequence[int]) -> Dataset:
     """Maps whose colours have ``strengths`` [S, E, C], and episodes of soft-optimal experts."""
-    maps = draw(seeds, world.size, world.texture, strengths, purpose=0)
-    settings = torus(world.size, strengths.shape[1])
-    reward = world.value * maps.quality
-    demos = demonstrate(settings, reward, world.horizon, world.episodes, seeds)
+    maps = draw(seeds, config.size, config.texture, strengths, purpose=0)
+    settings = torus(config.size, strengths.shape[1])
+    reward = config.value * maps.quality
+    demos = demonstrate(settings, reward, config.horizon, config.episodes, seeds)
     return Dataset(maps, demos, strengths.shape[2])
 
 
@@ -96,14 +65,21 @@ class Fitted(NamedTuple):
 
 
 def fit(
-    world: World, data: Dataset, variants: Sequence[Variant], how: Fit, seeds: Sequence[int]
+    config: CuedMapsConfig,
+    data: Dataset,
+    variants: Sequence[Variant],
+    hidden: int,
+    seeds: Sequence[int],
 ) -> Fitted:
-    """Fit every variant to every run's data; those that share a learner side by side."""
-    settings = torus(world.size, data.maps.kinds.shape[1])
+    """Fit every variant to every run's data; those that share a learner side by side.
+
+    ``hidden`` is the width of the learned reward, in place of ``config.hidden``; 0 for a linear one.
+    """
+    settings = torus(config.size, data.maps.kinds.shape[1])
     risks: dict[tuple[str, int], Risks] = {}
     for grouping in {v.grouping for v in variants}:
         for r, (demos, seed) in enumerate(zip(data.demos, seeds, strict=True)):
-            risks[grouping, r] = group_risks(settings, demos, grouping, world.horizon, seed)
+            risks[grouping, r] = group_risks(settings, demos, grouping, config.horizon, seed)
     inputs = features(data.colours)
     results: dict[Variant, tuple[np.ndarray, ...]] = {}
     shared = dict.fromkeys((v.penalty, v.warm, v.sees) for v in variants)
@@ -118,13 +94,13 @@ def fit(
             np.array([v.l2 for v, _ in runs]),
             [seeds[r] for _, r in runs],
             penalty=penalty,
-            horizon=world.horizon,
-            hidden=how.hidden,
-            learning_rate=how.learning_rate,
+            horizon=config.horizon,
+            hidden=hidden,
+            learning_rate=config.learning_rate,
             kinds=np.stack([data.maps.kinds[r] for _, r in runs]),
-            penalty_warmup=how.warmup if warm else 0,
+            penalty_warmup=config.warmup if warm else 0,
         )
-        reward = learner.fit(how.iterations, record_every=how.warmup)
+        reward = learner.fit(config.iterations, record_every=config.warmup)
         before, last = learner.records[1], learner.records[-1]
         found = (reward, last.log_likelihood.mean(-1), before.penalty, last.penalty)
         parts = zip(*(np.split(array, len(chosen)) for array in found), strict=True)
@@ -132,29 +108,26 @@ def fit(
     return Fitted(*map(np.stack, zip(*(results[v] for v in variants), strict=True)))
 
 
-def unseen(world: World, fitted: Fitted, seeds: Sequence[int], colours: int) -> Judgement:
+def unseen(config: CuedMapsConfig, fitted: Fitted, seeds: Sequence[int], colours: int) -> Judgement:
     """How the rewards do in maps of the unseen setting; each field [V, S]."""
-    strengths = np.full((len(seeds), world.unseen_maps, colours), world.unseen)
-    maps = draw(seeds, world.size, world.texture, strengths, purpose=1)
-    settings = torus(world.size, world.unseen_maps)
-    each = [judge(settings, maps, r, world.value, world.horizon) for r in fitted.reward]
+    strengths = np.full((len(seeds), config.unseen_maps, colours), config.unseen)
+    maps = draw(seeds, config.size, config.texture, strengths, purpose=1)
+    settings = torus(config.size, config.unseen_maps)
+    each = [judge(settings, maps, r, config.value, config.horizon) for r in fitted.reward]
     return Judgement(*map(np.stack, zip(*each, strict=True)))
 
 
-def hint_weights(fitted: Fitted) -> np.ndarray:
-    """The weights in the rewards of the texture and of each colour [V, S, 1 + C]."""
-    return np.stack([cued_maps.hint_weights(reward) for reward in fitted.reward])
-
-
-def held_out_risk(world: World, data: Dataset, setting: int, fitted: Fitted) -> np.ndarray:
+def held_out_risk(
+    config: CuedMapsConfig, data: Dataset, setting: int, fitted: Fitted
+) -> np.ndarray:
     """Negative log-likelihood of one setting's demonstrations [V, S], in nats per episode."""
-    settings = torus(world.size, 1)
+    settings = torus(config.size, 1)
     kinds = data.maps.kinds[:, setting]
     visits = np.stack([d.states[setting] for d in data.demos])
     seen = np.take_along_axis(kinds, visits.reshape(len(kinds), -1), axis=1)
     found = []
     for reward in fitted.reward:
-        partition = solve(settings, np.take_along_axis(reward, kinds, 1)[:, None], world.horizon)
+        partition = solve(settings, np.take_along_axis(reward, kinds, 1)[:, None], config.horizon)
         path = np.take_along_axis(reward, seen, 1).sum(1) / visits.shape[1]
         found.append(partition.log_partition[:, 0] - path)
     return np.stack(found)

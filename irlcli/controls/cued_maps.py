@@ -75,7 +75,7 @@ def features(colours: int) -> np.ndarray:
 
 
 def hint_weights(reward: np.ndarray) -> np.ndarray:
-    """The weights in ``reward`` [R, T] of the texture and of each colour [R, F].
+    """The weights in ``reward`` [..., T] of the texture and of each colour [..., F].
 
     This is the mean over all kinds of cells of what turning this one from bad to good adds.
     """

@@ -230,13 +230,10 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
     import numpy as np
 
     from irlcli.controls import cued_fits
+    from irlcli.controls.cued_maps import hint_weights
 
     seeds = range(m.first_seed, m.first_seed + m.seeds)
-    world = cued_fits.World(
-        m.size, m.horizon, m.value, m.texture, m.episodes, m.unseen, m.unseen_maps
-    )
     hidden = m.hidden if case.features == "learned" else 0
-    how = cued_fits.Fit(hidden, m.iterations, m.warmup, m.learning_rate)
     strengths = np.empty((m.seeds, len(case.strengths), case.colours))
     strengths[...] = np.array(case.strengths)[:, None]
     if case.colours > 1:
@@ -244,14 +241,14 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
             rng = np.random.default_rng((seed, 5))
             ends = min(case.strengths), max(case.strengths)
             strengths[r] = rng.uniform(*ends, strengths[r].shape)
-    data = cued_fits.dataset(world, strengths, seeds)
+    data = cued_fits.dataset(m, strengths, seeds)
     rows = []
     for left_out in (-1, *(range(len(case.strengths)) if case.leave_out else ())):
         kept = data if left_out < 0 else cued_fits.without(data, left_out)
-        fitted = cued_fits.fit(world, kept, case.variants, how, seeds)
-        weights = cued_fits.hint_weights(fitted)
+        fitted = cued_fits.fit(m, kept, case.variants, hidden, seeds)
+        weights = hint_weights(fitted.reward)
         measures = {
-            **cued_fits.unseen(world, fitted, seeds, case.colours)._asdict(),
+            **cued_fits.unseen(m, fitted, seeds, case.colours)._asdict(),
             "pays_texture": weights[..., 0],
             "pays_colour": weights[..., 1:].mean(-1),
             "log_likelihood": fitted.log_likelihood,
@@ -259,7 +256,7 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
             "penalty": fitted.penalty,
         }
         if left_out >= 0:
-            measures["held_out_risk"] = cued_fits.held_out_risk(world, data, left_out, fitted)
+            measures["held_out_risk"] = cued_fits.held_out_risk(m, data, left_out, fitted)
         rows += [
             {
                 "case": case.name,

@@ -3,24 +3,34 @@
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace
 
+from irlcli.configs import CuedMapsConfig
 from irlcli.controls.cued_fits import (
-    Fit,
-    World,
     dataset,
     fit,
     held_out_risk,
-    hint_weights,
     unseen,
     without,
 )
-from irlcli.controls.cued_maps import draw, features, torus
+from irlcli.controls.cued_maps import draw, features, hint_weights, torus
 from irlcli.controls.variants import Variant
 from irlcli.learners.maxent import MaxEnt, Risks
 from irlcli.learners.soft_values import solve
 
-WORLD = World(12, 6, 2.0, 0.75, 600, 0.1, 2)
-LINEAR = Fit(0, 250, 100, 1e-2)
+CONFIG = CuedMapsConfig(
+    size=12,
+    horizon=6,
+    value=2.0,
+    texture=0.75,
+    episodes=600,
+    unseen=0.1,
+    unseen_maps=2,
+    iterations=250,
+    warmup=100,
+    learning_rate=1e-2,
+)
+LINEAR = 0
 SEEDS = range(4)
 
 
@@ -52,17 +62,17 @@ def test_the_invariant_reward_has_no_penalty_and_is_a_fixed_point(penalty):
 
 @pytest.fixture(scope="module")
 def data():
-    return dataset(WORLD, strengths(0.95, 0.8), SEEDS)
+    return dataset(CONFIG, strengths(0.95, 0.8), SEEDS)
 
 
-def quality(data, variants, how=LINEAR):
+def quality(data, variants, hidden=LINEAR):
     """Mean quality visited in unseen maps, for each variant."""
-    fitted = fit(WORLD, data, variants, how, SEEDS)
-    return unseen(WORLD, fitted, SEEDS, 1).quality.mean(-1)
+    fitted = fit(CONFIG, data, variants, hidden, SEEDS)
+    return unseen(CONFIG, fitted, SEEDS, 1).quality.mean(-1)
 
 
-@pytest.mark.parametrize("how", [LINEAR, Fit(8, 250, 100, 1e-2)], ids=["linear", "learned"])
-def test_irm_wins_and_neither_its_control_nor_l2_do(data, how):
+@pytest.mark.parametrize("hidden", [LINEAR, 8], ids=["linear", "learned"])
+def test_irm_wins_and_neither_its_control_nor_l2_do(data, hidden):
     """Chance is 0.5."""
     erm, decayed, shuffled, irm, texture = quality(
         data,
@@ -73,14 +83,14 @@ def test_irm_wins_and_neither_its_control_nor_l2_do(data, how):
             Variant("per-setting", "irmv1-full", 1e4),
             Variant("pooled", sees="texture"),
         ],
-        how,
+        hidden,
     )
     assert max(erm, decayed, shuffled) < 0.45
     assert 0.52 < irm < texture + 0.03
 
 
 def test_without_a_gap_between_the_settings_nothing_helps():
-    data = dataset(WORLD, strengths(0.875, 0.875), SEEDS)
+    data = dataset(CONFIG, strengths(0.875, 0.875), SEEDS)
     irm, vrex = quality(
         data,
         [Variant("per-setting", "irmv1-full", 1e2), Variant("per-setting", "vrex", 1e2)],
@@ -89,15 +99,17 @@ def test_without_a_gap_between_the_settings_nothing_helps():
 
 
 def test_erm_pays_for_the_colour_and_the_texture_alone_does_not(data):
-    fitted = fit(WORLD, data, [Variant("pooled"), Variant("pooled", sees="texture")], LINEAR, SEEDS)
-    (erm, texture) = hint_weights(fitted)
+    fitted = fit(
+        CONFIG, data, [Variant("pooled"), Variant("pooled", sees="texture")], LINEAR, SEEDS
+    )
+    (erm, texture) = hint_weights(fitted.reward)
     assert (erm[:, 1] > erm[:, 0]).all() and (erm > 0.0).all()
     assert (texture[:, 1] == 0.0).all() and (texture[:, 0] > 0.5).all()
 
 
 def test_the_risk_of_a_setting_is_its_negative_log_likelihood(data):
-    fitted = fit(WORLD, data, [Variant("pooled")], LINEAR._replace(iterations=120), SEEDS)
-    each = [held_out_risk(WORLD, data, e, fitted) for e in (0, 1)]
+    fitted = fit(replace(CONFIG, iterations=120), data, [Variant("pooled")], LINEAR, SEEDS)
+    each = [held_out_risk(CONFIG, data, e, fitted) for e in (0, 1)]
     # The record is made before the last update.
     assert np.allclose(np.mean(each, axis=0), -fitted.log_likelihood, rtol=1e-3)
 
@@ -106,8 +118,8 @@ def test_group_dro_nears_the_smallest_worst_risk_as_lambda_grows(data):
     """Its loss does not grow with lambda, so a large one must not make the steps small."""
     weights = (0.0, 10.0, 100.0)
     chosen = [Variant("per-setting", "group-dro", weight) for weight in weights]
-    fitted = fit(WORLD, data, chosen, LINEAR, SEEDS)
-    risks = np.stack([held_out_risk(WORLD, data, e, fitted) for e in (0, 1)])
+    fitted = fit(CONFIG, data, chosen, LINEAR, SEEDS)
+    risks = np.stack([held_out_risk(CONFIG, data, e, fitted) for e in (0, 1)])
     worst = risks.max(axis=0).mean(axis=-1)
     assert worst[2] < worst[0] and worst[2] <= worst[1] + 1e-3
 
@@ -120,7 +132,7 @@ def test_a_setting_that_is_left_out_is_gone(data):
 
 def test_variants_come_back_in_the_order_that_they_were_asked_for(data):
     wanted = [Variant("pooled"), Variant("per-setting", "vrex", 10.0), Variant("pooled", l2=5.0)]
-    short = LINEAR._replace(iterations=110)
-    together = fit(WORLD, data, wanted, short, SEEDS).reward
+    short = replace(CONFIG, iterations=110)
+    together = fit(short, data, wanted, LINEAR, SEEDS).reward
     for k, variant in enumerate(wanted):
-        assert np.allclose(together[k], fit(WORLD, data, [variant], short, SEEDS).reward[0])
+        assert np.allclose(together[k], fit(short, data, [variant], LINEAR, SEEDS).reward[0])
