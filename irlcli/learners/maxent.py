@@ -186,8 +186,7 @@ class MaxEnt:
             to the risk's scale.
 
     Raises:
-        ValueError: shapes that do not fit; a width or rate out of range; weights, penalty weights
-            or l2 that are negative or not finite.
+        ValueError: a learning rate that is negative or not a number.
     """
 
     def __init__(
@@ -206,40 +205,17 @@ class MaxEnt:
         kinds: np.ndarray | None = None,
         penalty_warmup: int = 0,
     ):
-        e, n, _ = settings.shape
-        runs = len(seeds)
         features = np.asarray(features, dtype=np.float64)
-        rows = n if kinds is None else len(features)
-        if features.ndim != 2 or len(features) != rows or not np.isfinite(features).all():
-            raise ValueError(f"features must be [{rows}, F] and finite, not {list(features.shape)}")
-        if kinds is not None and (
-            kinds.shape != (runs, e, n) or kinds.min() < 0 or kinds.max() >= rows
-        ):
-            raise ValueError(f"kinds must be {[runs, e, n]} indices below {rows}")
-        if hidden < 0:
-            raise ValueError(f"hidden must be a width, or 0 for a linear reward, not {hidden}")
         self._risks = stack_risks(risks)
-        k = self._risks.weights.shape[1]
-        for name, array, shape in (
-            ("occupancy", self._risks.occupancy, (runs, k, e, n)),
-            ("shares", self._risks.shares, (runs, k, e)),
-            ("weights", self._risks.weights, (runs, k)),
-            ("penalty_weight", penalty_weight, (runs,)),
-            ("l2", l2, (runs,)),
-        ):
-            if np.shape(array) != shape:
-                raise ValueError(f"{name} must be {list(shape)}, not {list(np.shape(array))}")
-            if not (np.isfinite(array).all() and (np.asarray(array) >= 0.0).all()):
-                raise ValueError(f"{name} must be finite and not negative")
         self._settings, self._horizon = settings, horizon
-        self._kinds, self._n_kinds = kinds, rows
+        self._kinds, self._n_kinds = kinds, len(features)
         self._risks = self._risks._replace(occupancy=self._visits(self._risks.occupancy))
         self._expert = _expert_occupancy(self._risks)
         self._penalty = occupancy_penalty(penalty)
         self._penalty_weight = np.asarray(penalty_weight)
         self._divisor = np.array([loss_divisor(penalty, w) for w in self._penalty_weight])
         self._penalty_warmup = penalty_warmup
-        self._l2 = torch.as_tensor(np.asarray(l2, dtype=np.float64)).reshape(runs, 1, 1)
+        self._l2 = torch.as_tensor(np.asarray(l2, dtype=np.float64)).reshape(-1, 1, 1)
         self._features = torch.as_tensor(features)
         self._solution: Solution | None = None
         self._rescaled: Solution | None = None
@@ -332,10 +308,8 @@ class MaxEnt:
         after each of these. Returns the rewards [R, S].
 
         Raises:
-            ValueError: fewer than one iteration; or as :meth:`step`.
+            ValueError: as :meth:`step`.
         """
-        if iterations < 1:
-            raise ValueError(f"at least one iteration is needed, not {iterations}")
         while self.iterations < iterations:
             record = self.iterations % record_every == 0 or self.iterations == iterations - 1
             self.step(record)

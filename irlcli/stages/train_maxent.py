@@ -206,9 +206,6 @@ def side_by_side(
     """The learner of a reward for each of ``runs`` (config, demonstrations, seed).
 
     The configs differ at most in the grouping, lambda and L2.
-
-    Raises:
-        UsageError: a grid too large to solve.
     """
     import numpy as np
 
@@ -216,20 +213,19 @@ def side_by_side(
     from irlcli.learners.maxent import MaxEnt, group_risks
 
     m = runs[0][0]
-    with tasks.usable_input():
-        return MaxEnt(
-            settings,
-            tasks.features(m.inputs, grid),
-            [group_risks(settings, d, own.grouping, grid.horizon, s) for own, d, s in runs],
-            np.array([own.penalty_weight for own, _, _ in runs]),
-            np.array([own.l2 for own, _, _ in runs]),
-            [seed for _, _, seed in runs],
-            penalty=m.penalty,
-            horizon=grid.horizon,
-            hidden=m.hidden if m.features == "learned" else 0,
-            learning_rate=m.learning_rate,
-            penalty_warmup=m.penalty_warmup_iterations or 0,
-        )
+    return MaxEnt(
+        settings,
+        tasks.features(m.inputs, grid),
+        [group_risks(settings, d, own.grouping, grid.horizon, s) for own, d, s in runs],
+        np.array([own.penalty_weight for own, _, _ in runs]),
+        np.array([own.l2 for own, _, _ in runs]),
+        [seed for _, _, seed in runs],
+        penalty=m.penalty,
+        horizon=grid.horizon,
+        hidden=m.hidden if m.features == "learned" else 0,
+        learning_rate=m.learning_rate,
+        penalty_warmup=m.penalty_warmup_iterations or 0,
+    )
 
 
 def judge(
