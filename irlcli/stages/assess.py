@@ -162,12 +162,9 @@ def _rows(member: Member, episodes: Sequence[Trajectory]) -> list[dict[str, Any]
 
 def _episodes(job: Job, entry: Entry) -> Sequence[Trajectory]:
     from irlcli.data.demonstrations import read_demonstrations
-    from irlcli.errors import IntegrityError
 
-    env, directory = job.parameters.environment.name, job.inputs[entry.role]
-    recorded = read_demonstrations(directory)
-    if recorded.env != env or list(recorded.trajectories) != [entry.setting]:
-        raise IntegrityError(f"{directory} holds no episodes in {env} {entry.setting}")
+    recorded = read_demonstrations(job.inputs[entry.role])
+    recorded.require(job.parameters.environment.name, [entry.setting])
     return recorded.trajectories[entry.setting]
 
 

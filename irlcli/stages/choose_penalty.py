@@ -124,10 +124,9 @@ def _role(weight: float, setting: str) -> str:
 
 def run(job: Job) -> None:
     """Compare the mean scores; of weights that tie, the smallest is chosen."""
-    import json
-
     from irlcli.data import descriptions
     from irlcli.data.outputs import write_json
+    from irlcli.store import read_json
 
     p: Parameters = job.parameters
     scores = []
@@ -135,9 +134,7 @@ def run(job: Job) -> None:
         row = {}
         for text in p.settings:
             path = job.inputs[_role(weight, text)]
-            summary = descriptions.parse(
-                json.loads(path.read_text()), descriptions.Evaluation, path
-            )
+            summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
             row[text] = summary.settings[0].mean_return
         scores.append(row)
     means = [sum(row.values()) / len(row) for row in scores]

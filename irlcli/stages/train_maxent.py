@@ -161,23 +161,19 @@ def read_gridworld(
     """The grid of the demonstrations in ``directory``, and their episodes by setting.
 
     Raises:
-        IntegrityError: damaged, or of another environment or other settings than expected.
+        IntegrityError: damaged, or of another environment, or without one of the settings.
     """
     from irlcli.data.demonstrations import read_demonstrations
 
     demos = read_demonstrations(directory)
-    if demos.env != env or list(demos.trajectories) != list(texts):
-        raise IntegrityError(
-            f"the demonstrations are of {demos.env} {', '.join(demos.trajectories)}, not of "
-            f"{env} {', '.join(texts)}"
-        )
+    demos.require(env, texts)
     try:
         grid = msgspec.convert(demos.metadata["gridworld"], GridworldConfig)
     except (KeyError, msgspec.ValidationError) as error:
         raise IntegrityError(
             f"the demonstrations in {directory} do not describe their gridworld ({error})"
         ) from None
-    return grid, list(demos.trajectories.values())
+    return grid, [demos.trajectories[text] for text in texts]
 
 
 def indexed(
