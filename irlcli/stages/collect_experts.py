@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -27,6 +27,7 @@ from irlcli.stages.base import (
 
 if TYPE_CHECKING:
     from irlcli.rl.policy import Policy
+    from irlcli.trajectories import Trajectory
 
 _SAVED = ".zip"
 # The role of an input, before the setting.
@@ -135,58 +136,70 @@ def _check_experts(
 
 def run(job: Job) -> None:
     """Roll every expert out in its own setting."""
-    from irlcli.data.demonstrations import write_demonstrations
-    from irlcli.data.outputs import write_json
-    from irlcli.data.tensors import load_policy_file
     from irlcli.rl.rollout import roll_out
-    from irlcli.rl.saved import File, load_saved
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
-    groups, summary = [], []
-    for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True)):
-        setting = parse_setting(p.environment.name, text)
-        policy: Policy
-        path = job.inputs[f"expert {text}"]
-        if path.suffix == _SAVED:
-            beside = job.inputs.get(f"{_NORMALISER} {text}")
-            saved, *statistics = (File(str(f), f.read_bytes()) for f in (path, beside) if f)
-            policy = load_saved(saved, p.environment.name, setting, *statistics)
-        else:
-            policy, _ = load_policy_file(path)
-        # Of the setting's own, so that they are the same whatever else the dataset holds.
-        purpose = f"{STAGE.name} {text}"
-        trajectories = roll_out(
-            p.environment.name, setting, policy, episodes, p.seed, purpose, p.deterministic
+    env = p.environment.name
+    found = (
+        roll_out(
+            env,
+            parse_setting(env, text),
+            _expert(job, text),
+            episodes,
+            p.seed,
+            # Of the setting's own, so that they are the same whatever else the dataset holds.
+            f"{STAGE.name} {text}",
+            p.deterministic,
         )
-        job.warn_of_errors(text, trajectories)
-        groups.append((setting, trajectories))
-        summary.append(summary_of(text, trajectories))
-        facts = {text: shown(summary[-1]["mean_return"], summary[-1]["mean_progress"])}
-        job.console.progress(index + 1, len(p.settings), "settings", facts)
+        for text, episodes in zip(p.settings, p.episodes, strict=True)
+    )
     metadata = {
         "experts": {text: file_digest(job.inputs[f"expert {text}"]) for text in p.settings},
         "deterministic": p.deterministic,
     }
-    write_demonstrations(job.output, p.environment.name, groups, metadata)
-    write_json(job.output / "summary.json", {"env": p.environment.name, "settings": summary})
+    _record(job, found, metadata)
+
+
+def _expert(job: Job, text: str) -> Policy:
+    """The expert of setting ``text``, ours or a saved model of stable-baselines3."""
+    from irlcli.data.tensors import load_policy_file
+    from irlcli.rl.saved import File, load_saved
+
+    env, path = job.parameters.environment.name, job.inputs[f"expert {text}"]
+    if path.suffix != _SAVED:
+        return load_policy_file(path)[0]
+    beside = job.inputs.get(f"{_NORMALISER} {text}")
+    saved, *statistics = (File(str(f), f.read_bytes()) for f in (path, beside) if f)
+    return load_saved(saved, env, parse_setting(env, text), *statistics)
 
 
 def run_tabular(job: Job) -> None:
     """Sample the policy that value iteration finds in each setting, ties broken at random."""
-    from irlcli.data.demonstrations import write_demonstrations
-    from irlcli.data.outputs import write_json
     from irlcli.envs.gridworld import tasks as gridworlds
 
     p: TabularParameters = job.parameters
+    found = (
+        gridworlds.sample(text, p.gridworld, episodes, (p.seed, index))
+        for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True))
+    )
+    metadata = {"experts": "value iteration", "gridworld": msgspec.to_builtins(p.gridworld)}
+    _record(job, found, metadata)
+
+
+def _record(job: Job, found: Iterable[list[Trajectory]], metadata: Mapping[str, Any]) -> None:
+    """Write the demonstrations of each setting as they are made."""
+    from irlcli.data.demonstrations import write_demonstrations
+    from irlcli.data.outputs import write_json
+
+    p: Parameters | TabularParameters = job.parameters
     groups, summary = [], []
-    for index, (text, episodes) in enumerate(zip(p.settings, p.episodes, strict=True)):
-        trajectories = gridworlds.sample(text, p.gridworld, episodes, (p.seed, index))
+    for index, (text, trajectories) in enumerate(zip(p.settings, found, strict=True)):
+        job.warn_of_errors(text, trajectories)
         groups.append((parse_setting(p.environment.name, text), trajectories))
         summary.append(summary_of(text, trajectories))
-        facts = {text: f"return {summary[-1]['mean_return']:.0f}"}
+        facts = {text: shown(summary[-1]["mean_return"], summary[-1]["mean_progress"])}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
-    metadata = {"experts": "value iteration", "gridworld": msgspec.to_builtins(p.gridworld)}
     write_demonstrations(job.output, p.environment.name, groups, metadata)
     write_json(job.output / "summary.json", {"env": p.environment.name, "settings": summary})
 
