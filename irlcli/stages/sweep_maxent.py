@@ -158,23 +158,21 @@ def run(job: Job) -> None:
         for r, (v, seed) in enumerate(runs)
     ]
     write_table(pa.Table.from_pylist(rows), job.output / "rewards.parquet")
-    rows = []
-    for texts, seen in ((p.settings, True), (p.unseen, False)):
-        if not texts:
-            continue
-        measures = vars(judge(texts, p.gridworld, reward, p.shared.held_out))
-        rows += [
-            {
-                "variant": str(v),
-                **asdict(v),
-                "seed": seed,
-                "setting": text,
-                "seen": seen,
-                **{name: float(array[r, e]) for name, array in measures.items()},
-            }
-            for r, (v, seed) in enumerate(runs)
-            for e, text in enumerate(texts)
-        ]
+    rows = [
+        {
+            "variant": str(v),
+            **asdict(v),
+            "seed": seed,
+            "setting": text,
+            "seen": seen,
+            **{name: float(array[r, e]) for name, array in measures.items()},
+        }
+        for texts, seen, measures in judge(
+            p.settings, p.unseen, p.gridworld, reward, p.shared.held_out
+        )
+        for r, (v, seed) in enumerate(runs)
+        for e, text in enumerate(texts)
+    ]
     write_table(pa.Table.from_pylist(rows), job.output / "quality.parquet")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from irlcli.learners.maxent import MaxEnt
     from irlcli.learners.occupancy import Demonstrations
-    from irlcli.learners.tabular_quality import Quality
     from irlcli.tabular import StackedMDPs
     from irlcli.trajectories import Trajectory
 
@@ -143,16 +142,11 @@ def _metrics(learner: MaxEnt, settings: Sequence[str]) -> list[dict[str, Any]]:
 
 def _quality(p: Parameters, grid: GridworldConfig, reward: np.ndarray) -> list[dict[str, Any]]:
     """A row per setting, seen or unseen."""
-    rows = []
-    for texts, seen in ((p.settings, True), (p.unseen, False)):
-        if not texts:
-            continue
-        measures = vars(judge(texts, grid, reward, p.maxent.held_out))
-        rows += [
-            {"setting": text, "seen": seen, **{k: _number(a[0, e]) for k, a in measures.items()}}
-            for e, text in enumerate(texts)
-        ]
-    return rows
+    return [
+        {"setting": text, "seen": seen, **{k: _number(a[0, e]) for k, a in measures.items()}}
+        for texts, seen, measures in judge(p.settings, p.unseen, grid, reward, p.maxent.held_out)
+        for e, text in enumerate(texts)
+    ]
 
 
 def read_gridworld(
@@ -225,12 +219,18 @@ def side_by_side(
 
 
 def judge(
-    texts: Sequence[str], grid: GridworldConfig, reward: np.ndarray, held_out: int
-) -> Quality:
-    """How good ``reward`` [R, S] is in each of E settings.
+    seen: Sequence[str],
+    unseen: Sequence[str],
+    grid: GridworldConfig,
+    reward: np.ndarray,
+    held_out: int,
+) -> Iterator[tuple[Sequence[str], bool, dict[str, np.ndarray]]]:
+    """How good ``reward`` [R, S] is in the settings that are ``seen``, then in those that are not.
 
     The held-out episodes are ``held_out`` new ones of each setting's own expert, the same for
     every reward.
+
+    Yields E settings, whether they are seen, and each measure [R, E] by name.
 
     Raises:
         UsageError: a goal that cannot be reached, or a grid too large to solve.
@@ -238,12 +238,16 @@ def judge(
     from irlcli.envs.gridworld import tasks
     from irlcli.learners.tabular_quality import assess
 
-    settings = tasks.stacked(texts, grid)
-    # A dataset's entropy is two numbers, so three are never a dataset's.
-    episodes = [tasks.sample(t, grid, held_out, (0, e, held_out)) for e, t in enumerate(texts)]
-    demos = indexed(settings, episodes, grid)
-    with tasks.usable_input():
-        return assess(settings, reward, grid.horizon, demos)
+    for texts, is_seen in ((seen, True), (unseen, False)):
+        if not texts:
+            continue
+        settings = tasks.stacked(texts, grid)
+        # A dataset's entropy is two numbers, so three are never a dataset's.
+        episodes = [tasks.sample(t, grid, held_out, (0, e, held_out)) for e, t in enumerate(texts)]
+        demos = indexed(settings, episodes, grid)
+        with tasks.usable_input():
+            quality = assess(settings, reward, grid.horizon, demos)
+        yield texts, is_seen, vars(quality)
 
 
 def _number(x: float) -> float | None:
