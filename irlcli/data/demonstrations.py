@@ -98,7 +98,7 @@ def action_type(actions: np.ndarray) -> pa.DataType:
 
 def steps_schema(observation_size: int, action: pa.DataType, rewarded: bool = True) -> pa.Schema:
     """The columns of ``steps.parquet``."""
-    return _schema(
+    return table_schema(
         episode=pa.int32(),
         t=pa.int32(),
         obs=pa.list_(pa.float32(), observation_size),
@@ -111,7 +111,7 @@ def episodes_schema(
     observation_size: int, setting: pa.DataType | None = None, rewarded: bool = True
 ) -> pa.Schema:
     """The columns of ``episodes.parquet``."""
-    return _schema(
+    return table_schema(
         episode=pa.int32(),
         setting=setting or pa.string(),
         intervention=pa.list_(pa.float64()),
@@ -124,23 +124,21 @@ def episodes_schema(
     )
 
 
-def _schema(**columns: pa.DataType) -> pa.Schema:
+def table_schema(**columns: pa.DataType) -> pa.Schema:
+    """``columns`` by name, none of which holds nulls."""
     return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
 
 
 def _steps_table(schema: pa.Schema, index: int, trajectory: Trajectory) -> pa.Table:
-    steps, size = len(trajectory), trajectory.observations.shape[1]
-    actions = pa.array(trajectory.actions.ravel())
-    if trajectory.actions.ndim == 2:
-        actions = pa.FixedSizeListArray.from_arrays(actions, trajectory.actions.shape[1])
-    columns = [
-        pa.array(np.full(steps, index, dtype=np.int32)),
-        pa.array(np.arange(steps, dtype=np.int32)),
-        pa.FixedSizeListArray.from_arrays(pa.array(trajectory.observations[:-1].ravel()), size),
-        actions,
-        pa.array(trajectory.rewards),
-    ]
-    return pa.Table.from_arrays(columns, schema=schema)
+    steps = len(trajectory)
+    columns = (
+        np.full(steps, index, dtype=np.int32),
+        np.arange(steps, dtype=np.int32),
+        trajectory.observations[:-1],
+        trajectory.actions,
+        trajectory.rewards,
+    )
+    return pa.Table.from_arrays([array_column(array) for array in columns], schema=schema)
 
 
 def _episode_row(index: int, setting: Setting, trajectory: Trajectory) -> dict[str, Any]:
@@ -343,3 +341,11 @@ def column_array(column: pa.ChunkedArray) -> np.ndarray:
     size = column.type.list_size
     parts = [chunk.flatten().to_numpy().reshape(-1, size) for chunk in column.chunks]
     return np.concatenate(parts) if parts else np.empty((0, size), np.float32)
+
+
+def array_column(array: np.ndarray) -> pa.Array:
+    """An array [R] or [R, N] as a column: the inverse of :func:`column_array`."""
+    numbers = pa.array(np.ascontiguousarray(array).reshape(-1))
+    return (
+        numbers if array.ndim == 1 else pa.FixedSizeListArray.from_arrays(numbers, array.shape[1])
+    )

@@ -14,6 +14,7 @@ from irlcli.data.demonstrations import (
     STEPS,
     Episodes,
     action_type,
+    array_column,
     column_array,
     episodes_schema,
     file_metadata,
@@ -110,14 +111,14 @@ class _EpisodeTable:
         self._length = int(t[-1]) + 1 if open_ else 0
         if steps.rewards is not None:
             self._add_returns(steps.rewards, ends)
-        columns = [
-            pa.array(episode.astype(np.int32)),
-            pa.array(t.astype(np.int32)),
-            _fixed_lists(steps.observations),
-            _fixed_lists(steps.actions) if steps.actions.ndim == 2 else pa.array(steps.actions),
-            *([] if steps.rewards is None else [pa.array(steps.rewards)]),
-        ]
-        return pa.Table.from_arrays(columns, schema=schema)
+        columns = (
+            episode.astype(np.int32),
+            t.astype(np.int32),
+            steps.observations,
+            steps.actions,
+            *(() if steps.rewards is None else (steps.rewards,)),
+        )
+        return pa.Table.from_arrays([array_column(array) for array in columns], schema=schema)
 
     def _add_returns(self, rewards: np.ndarray, ends: np.ndarray) -> None:
         begin = 0
@@ -147,7 +148,7 @@ class _EpisodeTable:
             *([pa.array(self._returns, pa.float64())] if self._rewarded else []),
             pa.array(terminated),
             pa.array(~terminated),
-            _fixed_lists(final),
+            array_column(final),
         ]
         return pa.Table.from_arrays(columns, schema=schema)
 
@@ -156,11 +157,6 @@ class _EpisodeTable:
         places, _, lengths, _, _ = self._columns()
         returns = np.array(self._returns) if self._rewarded else np.full(len(places), np.nan)
         return Written(places, lengths, returns, self._rewarded)
-
-
-def _fixed_lists(array: np.ndarray) -> pa.FixedSizeListArray:
-    flat = pa.array(np.ascontiguousarray(array).reshape(-1))
-    return pa.FixedSizeListArray.from_arrays(flat, array.shape[1])
 
 
 def read_stream(directory: Path, size: int = PIECE) -> tuple[list[str], Iterator[Steps]]:

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from irlcli.data.demonstrations import action_type
+from irlcli.data.demonstrations import action_type, array_column, table_schema
 from irlcli.data.exchange.expected import (
     SETTING,
     Expected,
@@ -207,43 +207,33 @@ def write_transitions(
 
 def _schema(first: Steps, env: str) -> pa.Schema:
     obs = pa.list_(pa.float32(), first.observations.shape[1])
-    columns = {
-        "setting": pa.dictionary(pa.int32(), pa.string()),
-        "episode": pa.int32(),
-        "seed": pa.int64(),
-        "obs": obs,
-        "action": action_type(first.actions),
-        **({} if first.rewards is None else {"reward": pa.float64()}),
-        "next_obs": obs,
-        "terminated": pa.bool_(),
-        "truncated": pa.bool_(),
-    }
     tags = json.dumps({"transitions": SCHEMA, "env": env}, sort_keys=True)
-    return pa.schema(
-        [pa.field(name, kind, nullable=False) for name, kind in columns.items()],
-        metadata={"irlcli": tags},
-    )
+    return table_schema(
+        setting=pa.dictionary(pa.int32(), pa.string()),
+        episode=pa.int32(),
+        seed=pa.int64(),
+        obs=obs,
+        action=action_type(first.actions),
+        **({} if first.rewards is None else {"reward": pa.float64()}),
+        next_obs=obs,
+        terminated=pa.bool_(),
+        truncated=pa.bool_(),
+    ).with_metadata({"irlcli": tags})
 
 
 def _table(steps: Steps, schema: pa.Schema, names: pa.Array, done: int) -> pa.Table:
     ends = np.flatnonzero(steps.terminated | steps.truncated)
     episode = done + np.searchsorted(ends, np.arange(len(steps)))
-    columns = {
-        "setting": pa.DictionaryArray.from_arrays(steps.settings.astype(np.int32), names),
-        "episode": episode.astype(np.int32),
-        "seed": steps.seeds,
-        "obs": steps.observations,
-        "action": steps.actions,
-        "reward": steps.rewards,
-        "next_obs": steps.next_observations,
-        "terminated": steps.terminated,
-        "truncated": steps.truncated,
-    }
-    return pa.Table.from_arrays([_column(columns[name]) for name in schema.names], schema=schema)
-
-
-def _column(values: Any) -> pa.Array:
-    if isinstance(values, np.ndarray) and values.ndim == 2:
-        flat = pa.array(np.ascontiguousarray(values).reshape(-1))
-        return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-    return values if isinstance(values, pa.Array) else pa.array(values)
+    arrays = (
+        episode.astype(np.int32),
+        steps.seeds,
+        steps.observations,
+        steps.actions,
+        *(() if steps.rewards is None else (steps.rewards,)),
+        steps.next_observations,
+        steps.terminated,
+        steps.truncated,
+    )
+    settings = pa.DictionaryArray.from_arrays(steps.settings.astype(np.int32), names)
+    columns = [settings, *map(array_column, arrays)]
+    return pa.Table.from_arrays(columns, schema=schema)
