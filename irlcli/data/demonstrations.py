@@ -194,15 +194,8 @@ def read_demonstrations(directory: Path) -> Demonstrations:
         IntegrityError: missing, damaged, inconsistent, or written with a newer schema.
     """
     tags = read_metadata(directory)
-    try:
-        with open_files(directory) as (steps, episodes):
-            trajectories = _parse(steps.read(), read_episodes(episodes, steps.metadata.num_rows))
-    except FileNotFoundError as error:
-        raise IntegrityError(f"{error.filename or STEPS} is missing in {directory}") from None
-    except UNREADABLE as error:
-        raise IntegrityError(
-            f"the demonstrations in {directory} are damaged ({first_line(error)})"
-        ) from None
+    with open_files(directory) as (steps, episodes):
+        trajectories = _parse(steps.read(), read_episodes(episodes, steps.metadata.num_rows))
     return Demonstrations(tags["env"], trajectories, tags)
 
 
@@ -211,15 +204,23 @@ def open_files(directory: Path) -> Iterator[tuple[pq.ParquetFile, pq.ParquetFile
     """The two files of a dataset, with the columns that they must have; nothing is read yet.
 
     Raises:
-        ValueError, OSError, ArrowException: not a dataset.
+        IntegrityError: missing or damaged; also for what is raised while they are read.
     """
-    with (
-        open_table(directory / STEPS) as steps,
-        open_table(directory / EPISODES, texts=["setting"]) as episodes,
-    ):
-        # Before any column is read: these columns cannot be nested or of unlimited width.
-        _check_schemas(steps.schema_arrow, episodes.schema_arrow)
-        yield steps, episodes
+    try:
+        with (
+            open_table(directory / STEPS) as steps,
+            open_table(directory / EPISODES, texts=["setting"]) as episodes,
+        ):
+            # Before any column is read: these columns cannot be nested or of unlimited width.
+            _check_schemas(steps.schema_arrow, episodes.schema_arrow)
+            yield steps, episodes
+    except FileNotFoundError as error:
+        missing = Path(error.filename or STEPS).name
+        raise IntegrityError(f"{directory} holds no demonstrations: {missing} is missing") from None
+    except UNREADABLE as error:
+        raise IntegrityError(
+            f"the demonstrations in {directory} are damaged ({first_line(error)})"
+        ) from None
 
 
 def _check_schemas(steps: pa.Schema, episodes: pa.Schema) -> None:
@@ -266,7 +267,7 @@ def read_episodes(file: pq.ParquetFile, steps: int) -> Episodes:
     """
     # The settings' texts already hold the intervention values.
     table = file.read([name for name in file.schema_arrow.names if name != "intervention"])
-    _refuse_nulls(table)
+    refuse_nulls(table)
     settings = _texts(table["setting"])
     indices, lengths = table["episode"].to_numpy(), table["length"].to_numpy()
     if len(table) == 0:
@@ -288,16 +289,15 @@ def read_episodes(file: pq.ParquetFile, steps: int) -> Episodes:
 
 
 def _parse(steps: pa.Table, episodes: Episodes) -> dict[str, tuple[Trajectory, ...]]:
-    _refuse_nulls(steps)
+    refuse_nulls(steps)
     stops = np.cumsum(episodes.lengths, dtype=np.int64)
     starts = stops - episodes.lengths
     numbers = np.arange(len(stops))
-    if not np.array_equal(
-        steps["episode"].to_numpy(), np.repeat(numbers, episodes.lengths)
-    ) or not np.array_equal(
-        steps["t"].to_numpy(), np.arange(len(steps)) - np.repeat(starts, episodes.lengths)
-    ):
-        raise ValueError("the steps are not numbered by episode and time")
+    check_numbers(
+        {name: steps[name].to_numpy() for name in ("episode", "t")},
+        np.repeat(numbers, episodes.lengths),
+        np.arange(len(steps)) - np.repeat(starts, episodes.lengths),
+    )
     observations, actions = column_array(steps["obs"]), column_array(steps["action"])
     rewards = np.full(len(steps), np.nan)
     if episodes.returns is not None:
@@ -320,9 +320,24 @@ def _parse(steps: pa.Table, episodes: Episodes) -> dict[str, tuple[Trajectory, .
     return {setting: tuple(group) for setting, group in groups.items()}
 
 
-def _refuse_nulls(table: pa.Table) -> None:
+def refuse_nulls(table: pa.Table) -> None:
+    """Check that ``table`` holds no nulls.
+
+    Raises:
+        ValueError: it does.
+    """
     if any(column.null_count for column in table.columns):
         raise ValueError("a column holds nulls")
+
+
+def check_numbers(steps: Mapping[str, np.ndarray], episode: np.ndarray, t: np.ndarray) -> None:
+    """Check that rows of ``steps`` have the numbers ``episode`` and ``t`` [R].
+
+    Raises:
+        ValueError: they do not.
+    """
+    if not (np.array_equal(steps["episode"], episode) and np.array_equal(steps["t"], t)):
+        raise ValueError("the steps are not numbered by episode and time")
 
 
 def _texts(column: pa.ChunkedArray) -> list[str]:

@@ -15,18 +15,20 @@ from irlcli.data.demonstrations import (
     Episodes,
     action_type,
     array_column,
+    check_numbers,
     column_array,
     episodes_schema,
     file_metadata,
     intervention_numbers,
     open_files,
     read_episodes,
+    refuse_nulls,
     steps_schema,
 )
 from irlcli.data.descriptions import MOST_EPISODES
-from irlcli.data.parquet import UNREADABLE, batches, write_table, writer
+from irlcli.data.parquet import batches, write_table, writer
 from irlcli.data.steps import PIECE, Steps, mixed_rewards, pieces
-from irlcli.errors import IntegrityError, UsageError, first_line
+from irlcli.errors import UsageError
 from irlcli.interventions import Setting
 
 
@@ -167,7 +169,7 @@ def read_stream(directory: Path, size: int = PIECE) -> tuple[list[str], Iterator
     Raises:
         IntegrityError: missing or damaged; also while the steps are read.
     """
-    with _readable(directory), open_files(directory) as (steps, episodes):
+    with open_files(directory) as (steps, episodes):
         found = read_episodes(episodes, steps.metadata.num_rows)
     settings = list(dict.fromkeys(found.settings))
     return settings, _stream(directory, found, settings, size)
@@ -181,20 +183,16 @@ def _stream(directory: Path, episodes: Episodes, settings: list[str], size: int)
     stops = np.cumsum(episodes.lengths, dtype=np.int64)
     starts = stops - episodes.lengths
     done, kept = 0, None
-    with _readable(directory), open_files(directory) as (file, _):
+    with open_files(directory) as (file, _):
         for batch in batches(file, size):
             table = pa.Table.from_batches([batch])
-            if any(column.null_count for column in table.columns):
-                raise ValueError("a column holds nulls")
+            refuse_nulls(table)
             arrays = {name: column_array(table[name]) for name in table.column_names}
             if kept is not None:
                 arrays = {n: np.concatenate([kept[n], array]) for n, array in arrays.items()}
             rows = done + np.arange(len(arrays["t"]))
             episode = np.searchsorted(stops, rows, side="right")
-            if not np.array_equal(arrays["episode"], episode) or not np.array_equal(
-                arrays["t"], rows - starts[episode]
-            ):
-                raise ValueError("the steps are not numbered by episode and time")
+            check_numbers(arrays, episode, rows - starts[episode])
             ends = rows == stops[episode] - 1
             # The successor of the last row may stand in the next batch.
             count = len(rows) if ends[-1] else len(rows) - 1
@@ -222,21 +220,3 @@ def _stream(directory: Path, episodes: Episodes, settings: list[str], size: int)
 
 def _place(directory: Path, first: int):
     return lambda row: f"{directory / STEPS} row {first + row}"
-
-
-class _readable:
-    """Reports what reading raises for damaged and for crafted files."""
-
-    def __init__(self, directory: Path):
-        self._directory = directory
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind, error, trace) -> None:
-        if isinstance(error, FileNotFoundError):
-            raise IntegrityError(f"{self._directory} holds no demonstrations") from None
-        if isinstance(error, UNREADABLE):
-            raise IntegrityError(
-                f"the demonstrations in {self._directory} are damaged ({first_line(error)})"
-            ) from None
