@@ -63,6 +63,14 @@ class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     score: Finite
 
 
+class RewardOrigin(Struct, frozen=True, kw_only=True):
+    """How a reward was learned, in the documents of what was measured by it."""
+
+    method: MethodName
+    seed: int
+    settings: tuple[str, ...]
+
+
 class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """``reward.json``, and the description inside ``reward.pt``.
 
@@ -82,6 +90,11 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     quantiles: Quantiles
     selected: Selected | None = None
     stopped_after: Annotated[int, Meta(ge=1)] | None = None
+
+    @property
+    def origin(self) -> RewardOrigin:
+        """How it was learned."""
+        return RewardOrigin(method=self.method, seed=self.seed, settings=self.settings)
 
 
 class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -166,14 +179,6 @@ class Subject(Struct, frozen=True, kw_only=True):
     restarts: tuple[Finite, ...] = ()
 
 
-class LearnedReward(Struct, frozen=True, kw_only=True):
-    """The learned reward that an evaluation measured a policy by, besides the true one."""
-
-    method: MethodName
-    seed: int
-    settings: tuple[str, ...]
-
-
 class Returns(Struct, frozen=True, kw_only=True):
     """Mean returns in one setting; the learned return is the mean of g / scale per episode."""
 
@@ -191,7 +196,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     """``summary.json`` of an evaluation; ``reward`` is None if only true returns were measured."""
 
     policy: Subject
-    reward: LearnedReward | None = None
+    reward: RewardOrigin | None = None
     settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
 
 
@@ -282,7 +287,7 @@ class Assessment(Struct, frozen=True, kw_only=True):
     """
 
     env: str
-    reward: LearnedReward
+    reward: RewardOrigin
     settings: Annotated[tuple[Assessed, ...], Meta(min_length=1)]
     pooled: Assessed | None
     bank: tuple[BankEntry, ...]
@@ -319,7 +324,7 @@ class CueContrast(Struct, frozen=True, kw_only=True):
     """
 
     env: str
-    reward: LearnedReward
+    reward: RewardOrigin
     scale: Positive
     settings: Annotated[tuple[HintContrast, ...], Meta(min_length=1)]
 

@@ -11,8 +11,8 @@ from irlcli.data.descriptions import (
     Assessed,
     Assessment,
     BankEntry,
-    LearnedReward,
     Measured,
+    RewardOrigin,
 )
 from irlcli.report.reward_quality import (
     Member,
@@ -26,7 +26,7 @@ from irlcli.report.reward_quality import (
 
 def assess(
     env: str,
-    reward: LearnedReward,
+    reward: RewardOrigin,
     members: Sequence[Member],
     epic: Mapping[str, float | None],
     epic_missing: str = "",

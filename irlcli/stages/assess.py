@@ -81,7 +81,6 @@ def run(job: Job) -> None:
     import numpy as np
     import pyarrow as pa
 
-    from irlcli.data.descriptions import LearnedReward
     from irlcli.data.outputs import write_json
     from irlcli.data.parquet import write_table
     from irlcli.data.tensors import load_reward_file
@@ -111,9 +110,8 @@ def run(job: Job) -> None:
         members.append(member)
         rows += _rows(member, episodes[entry])
         job.console.progress(index + 1, len(p.bank), "policies", {})
-    reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)
     epic, epic_missing = _epic_distances(p.environment, model, origin, episodes)
-    assessment = assess(p.environment.name, reward, members, epic, epic_missing)
+    assessment = assess(p.environment.name, origin.origin, members, epic, epic_missing)
     write_json(job.output / "assessment.json", msgspec.to_builtins(assessment))
     write_table(pa.Table.from_pylist(rows), job.output / "bank.parquet")
     scatter.draw_bank(job.output, assessment)

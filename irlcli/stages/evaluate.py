@@ -133,9 +133,7 @@ def run(job: Job) -> None:
     document = {"policy": subject}
     if "reward" in job.inputs:
         model, learned = load_reward_file(job.inputs["reward"])
-        document["reward"] = {
-            name: getattr(learned, name) for name in ("method", "seed", "settings")
-        }
+        document["reward"] = msgspec.to_builtins(learned.origin)
     rows, summary = [], []
     for index, text in enumerate(p.settings):
         if "reward" in job.inputs:

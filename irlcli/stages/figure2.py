@@ -10,7 +10,12 @@ from irlcli.configs import Config, MaxEntConfig
 from irlcli.interventions import Setting
 from irlcli.stages import sweep_maxent
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
-from irlcli.stages.sweep_maxent import PAPER_L2, PAPER_PENALTY_WEIGHTS, PENALTIES, Variant
+from irlcli.stages.sweep_maxent import (
+    FIGURE2_PENALTIES,
+    PAPER_L2,
+    PAPER_PENALTY_WEIGHTS,
+    SweepVariant,
+)
 from irlcli.stages.train_maxent import indexed, read_gridworld
 
 
@@ -48,16 +53,16 @@ def request(
     return Request(STAGE, parameters, inputs, f"figure2 {env}")
 
 
-def panels() -> list[tuple[Variant, str]]:
+def panels() -> list[tuple[SweepVariant, str]]:
     """The variants whose rewards are drawn, with their titles."""
     drawn = [
-        (Variant(grouping="pooled"), "ERM"),
-        (Variant(grouping="pooled", l2=PAPER_L2), f"ERM + L2 {PAPER_L2:g}"),
-        (Variant(grouping="balanced"), "ERM-balanced"),
+        (SweepVariant(grouping="pooled"), "ERM"),
+        (SweepVariant(grouping="pooled", l2=PAPER_L2), f"ERM + L2 {PAPER_L2:g}"),
+        (SweepVariant(grouping="balanced"), "ERM-balanced"),
     ]
-    for penalty in PENALTIES:
+    for penalty in FIGURE2_PENALTIES:
         for weight in PAPER_PENALTY_WEIGHTS:
-            variant = Variant(grouping="per-setting", penalty=penalty, penalty_weight=weight)
+            variant = SweepVariant(grouping="per-setting", penalty=penalty, penalty_weight=weight)
             drawn.append((variant, f"IRM {penalty}, $\\lambda$ = {weight:g}"))
     return drawn
 
@@ -84,7 +89,7 @@ def run(job: Job) -> None:
     seen, unseen = (tasks.stacked(texts, grid) for texts in (p.settings, p.unseen))
     demos = indexed(seen, episodes, grid)
 
-    def panel(variant: Variant, title: str) -> figure2.Panel:
+    def panel(variant: SweepVariant, title: str) -> figure2.Panel:
         reward = np.asarray(rewards[str(variant)])
         policy, _ = optimal_policy(unseen, reward[None], grid.horizon)
         routes = {

@@ -52,7 +52,7 @@ def request(
 def run(job: Job) -> None:
     """Score every demonstrated step twice for each hint: with the hint at 1 and at -1."""
     from irlcli.data.demonstrations import read_demonstrations
-    from irlcli.data.descriptions import CueContrast, HintContrast, LearnedReward
+    from irlcli.data.descriptions import CueContrast, HintContrast
     from irlcli.data.outputs import write_json
     from irlcli.data.tensors import load_reward_file
     from irlcli.report.cue import hint_contrasts
@@ -70,9 +70,8 @@ def run(job: Job) -> None:
         found.append(HintContrast(setting=text, steps=len(steps), **contrasts))
         facts = {text: " ".join(f"{name} {value:.2f}" for name, value in contrasts.items())}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
-    reward = LearnedReward(method=origin.method, seed=origin.seed, settings=origin.settings)
     contrast = CueContrast(
-        env=p.environment.name, reward=reward, scale=origin.scale, settings=tuple(found)
+        env=p.environment.name, reward=origin.origin, scale=origin.scale, settings=tuple(found)
     )
     write_json(job.output / "cue.json", msgspec.to_builtins(contrast))
 

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from irlcli.tabular import StackedMDPs
 
 # The penalties that Figure 2 compares; the paper's L2 weight of ERM and its lambdas of IRM.
-PENALTIES = ("irmv1", "closed-form")
+FIGURE2_PENALTIES = ("irmv1", "closed-form")
 PAPER_L2 = 1e-3
 PAPER_PENALTY_WEIGHTS = (0.01, 0.05)
 _NAMES = {"pooled": "erm", "balanced": "erm-balanced", "per-setting": "irm"}
 
 
-class Variant(msgspec.Struct, frozen=True, kw_only=True):
+class SweepVariant(msgspec.Struct, frozen=True, kw_only=True):
     """One method of the sweep; the fields are those of :class:`irlcli.configs.MaxEntConfig`."""
 
     grouping: str
@@ -57,22 +57,22 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     unseen: tuple[str, ...]
     seeds: tuple[int, ...]
-    variants: tuple[Variant, ...]
+    variants: tuple[SweepVariant, ...]
     gridworld: GridworldConfig
     shared: MaxEntConfig
 
 
-def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Variant, ...]:
+def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[SweepVariant, ...]:
     """The baselines, then each penalty at every lambda, with true and with shuffled labels.
 
     With lambda 0 both are ERM-balanced, which is therefore the low end of every sweep over lambda.
     """
     weights = sorted({*penalty_weights, *PAPER_PENALTY_WEIGHTS} - {0.0})
-    found = [Variant(grouping="pooled", l2=l2) for l2 in sorted({*l2s, PAPER_L2, 0.0})]
-    found.append(Variant(grouping="balanced"))
+    found = [SweepVariant(grouping="pooled", l2=l2) for l2 in sorted({*l2s, PAPER_L2, 0.0})]
+    found.append(SweepVariant(grouping="balanced"))
     found += [
-        Variant(grouping=grouping, penalty=penalty, penalty_weight=weight)
-        for penalty in PENALTIES
+        SweepVariant(grouping=grouping, penalty=penalty, penalty_weight=weight)
+        for penalty in FIGURE2_PENALTIES
         for grouping in ("per-setting", "shuffled")
         for weight in weights
     ]
@@ -81,9 +81,11 @@ def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Va
 
 def shared_config(config: Config) -> MaxEntConfig:
     """The hyperparameters of all variants; what the variants replace is at its default."""
-    penalised = Variant(grouping="per-setting", penalty=PENALTIES[0], penalty_weight=1.0)
+    penalised = SweepVariant(
+        grouping="per-setting", penalty=FIGURE2_PENALTIES[0], penalty_weight=1.0
+    )
     relevant = relevant_maxent(replace(config.maxent, **asdict(penalised)))
-    return replace(relevant, **asdict(Variant(grouping="pooled")))
+    return replace(relevant, **asdict(SweepVariant(grouping="pooled")))
 
 
 def datasets(env: str, settings_: Sequence[Setting], config: Config) -> dict[int, Request]:
@@ -145,7 +147,7 @@ def run(job: Job) -> None:
     state = tensors.restore(job.checkpoints.load(), {"rewards", "fit"}, job.checkpoints.discard)
     with tensors.fitting(job.output.parent):
         rewards = [] if state is None else [tensor.numpy() for tensor in state["rewards"]]
-    runs: list[tuple[Variant, int]] = []
+    runs: list[tuple[SweepVariant, int]] = []
     for k, penalty in enumerate(penalties):
         chosen = list(product([v for v in p.variants if v.penalty == penalty], p.seeds))
         runs += chosen
@@ -180,7 +182,7 @@ def _fit(
     job: Job,
     settings: StackedMDPs,
     demos: Mapping[int, Demonstrations],
-    runs: Sequence[tuple[Variant, int]],
+    runs: Sequence[tuple[SweepVariant, int]],
     rewards: Sequence[np.ndarray],
     state: Any,
 ) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from report_examples import BOUNCE, cell, column, complete, example, table
 
-from irlcli.data.descriptions import LearnedReward
+from irlcli.data.descriptions import RewardOrigin
 from irlcli.report.assessment import assess
 from irlcli.report.build import as_json, build
 from irlcli.report.reward_quality import Member
@@ -118,7 +118,7 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
         member("begun as a student", "retrained", 99.0),
         member("the other", "from-student", -50.0),
     ]
-    reward = LearnedReward(method="irm", seed=0, settings=("bounce=0.1",))
+    reward = RewardOrigin(method="irm", seed=0, settings=("bounce=0.1",))
     assessment = assess("lunar-lander", reward, members, {})
     verdicts = {r.policy: r.verdict for s in assessment.settings for r in s.retrained}
     assert verdicts["the other"] == "optimisation fell short"

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from irlcli.data.descriptions import Evaluation, LearnedReward, Returns, Subject
+from irlcli.data.descriptions import Evaluation, Returns, RewardOrigin, Subject
 from irlcli.errors import UsageError
 from irlcli.report.returns import rows
 
@@ -88,7 +88,7 @@ def test_returns_under_another_reward_are_a_row_of_their_own():
         (place,) = summary.settings
         summary = msgspec.structs.replace(
             summary,
-            reward=LearnedReward(method="irm", seed=seed, settings=("bounce=0.1",)),
+            reward=RewardOrigin(method="irm", seed=seed, settings=("bounce=0.1",)),
             settings=(msgspec.structs.replace(place, mean_learned_return=learned),),
         )
         return summary, made, own

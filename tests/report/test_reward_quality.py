@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from irlcli.data.descriptions import LearnedReward, Measured
+from irlcli.data.descriptions import Measured, RewardOrigin
 from irlcli.report import reward_quality
 from irlcli.report.assessment import assess
 from irlcli.report.reward_quality import (
@@ -234,7 +234,7 @@ TRIPLE = (("retrained", 10.0), ("expert", 100.0), ("random", 0.0))
 
 
 def reward(members):
-    return assess("ant", LearnedReward(method="erm", seed=0, settings=("e",)), members, {})
+    return assess("ant", RewardOrigin(method="erm", seed=0, settings=("e",)), members, {})
 
 
 def test_expert_minus_idle_is_per_step():

@@ -17,8 +17,8 @@ from irlcli.data.descriptions import (
     Assessed,
     Assessment,
     BankEntry,
-    LearnedReward,
     Measured,
+    RewardOrigin,
 )
 from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.store import Store
@@ -100,7 +100,7 @@ def test_progress_is_printed_where_a_robot_makes_some(capsys):
     )
     one = Agreement(policies=2, spearman=None, pearson=None)
     ranked = Assessed(setting="mass=4x", overall=one, lower_half=one)
-    reward = LearnedReward(method="erm", seed=0, settings=("mass=2x",))
+    reward = RewardOrigin(method="erm", seed=0, settings=("mass=2x",))
     print_assessment(
         Assessment(env="ant", reward=reward, settings=(ranked,), pooled=None, bank=bank)
     )
