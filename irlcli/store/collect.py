@@ -82,8 +82,7 @@ def missing(layout: Layout, index: Index) -> dict[str, Missing]:
             lost(id16).names.append(name)
     for id16 in sorted(index.reached_from(pointers.values())):
         artefact = index.artefacts[id16]
-        roles = [role for role, holders in index.parents(artefact).items() if not holders]
-        for source in _stored_inputs(artefact, roles):
+        for source in _stored_inputs(artefact, index.orphaned(artefact)):
             if not is_there(source):
                 lost(source).made.append(id16)
     return found

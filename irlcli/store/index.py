@@ -37,6 +37,10 @@ class Index:
         """For each input role of ``artefact``, the artefacts with that content."""
         return {role: self.holders(sha) for role, sha in artefact.manifest.record.inputs.items()}
 
+    def orphaned(self, artefact: Artefact) -> list[str]:
+        """The input roles of ``artefact`` whose content no artefact has."""
+        return [role for role, holders in self.parents(artefact).items() if not holders]
+
     def holders(self, sha: str) -> list[Artefact]:
         """The artefacts with an output, or all outputs together, of the content ``sha``."""
         return [self.artefacts[id16] for id16 in self._holders.get(sha, [])]

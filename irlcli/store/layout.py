@@ -201,6 +201,11 @@ def claims(layout: Layout) -> Iterator[tuple[Path, str]]:
             yield path, id16
 
 
+def pointer_to(id16: str) -> bytes:
+    """What the file of a name or key contains."""
+    return id16.encode() + b"\n"
+
+
 def pointed_to(path: Path) -> str | None:
     """The id that the file of a name or key contains; None if absent or malformed."""
     try:

@@ -15,7 +15,7 @@ from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.store.artefact import Artefact, Published, entries, read_artefact
 from irlcli.store.durable import fsync_directory, fsync_file, temporary_file, write_durably
 from irlcli.store.integrity import problems, repairing, set_aside
-from irlcli.store.layout import ID_DIGITS, Layout
+from irlcli.store.layout import ID_DIGITS, Layout, pointer_to
 from irlcli.store.manifest import (
     MANIFEST,
     PROVENANCE,
@@ -92,7 +92,7 @@ def claim(layout: Layout, artefact: Artefact) -> Artefact:
     """The artefact that holds its key in the end: this one, or an earlier one."""
     key = artefact.manifest.record.key
     pointer = layout.keys / key
-    with temporary_file(pointer, artefact.id.encode() + b"\n") as temporary:
+    with temporary_file(pointer, pointer_to(artefact.id)) as temporary:
         while True:
             try:
                 os.link(temporary, pointer)

@@ -17,6 +17,7 @@ from irlcli.store.layout import (
     is_name,
     is_prefix,
     pointed_to,
+    pointer_to,
 )
 from irlcli.store.read import get, ids
 
@@ -194,7 +195,7 @@ def set_name(layout: Layout, name: str, artefact: Artefact) -> str | None:
     if before == artefact.id:
         return None
     layout.names.mkdir(exist_ok=True)
-    write_durably(layout.names / name, artefact.id.encode() + b"\n")
+    write_durably(layout.names / name, pointer_to(artefact.id))
     return before
 
 
@@ -207,7 +208,7 @@ def claim_name(layout: Layout, name: str, artefact: Artefact) -> str | None:
     check_name(name)
     layout.names.mkdir(exist_ok=True)
     pointer = layout.names / name
-    with temporary_file(pointer, artefact.id.encode() + b"\n") as temporary:
+    with temporary_file(pointer, pointer_to(artefact.id)) as temporary:
         try:
             os.link(temporary, pointer)
         except FileExistsError:

@@ -21,7 +21,16 @@ from irlcli.store import layout as layouts
 from irlcli.store import references
 from irlcli.store.artefact import Artefact, read_artefact, stored_inputs
 from irlcli.store.index import Index
-from irlcli.store.layout import FORMAT, Layout, is_id, is_key, is_name, is_prefix, pointed_to
+from irlcli.store.layout import (
+    FORMAT,
+    Layout,
+    is_id,
+    is_key,
+    is_name,
+    is_prefix,
+    pointed_to,
+    pointer_to,
+)
 from irlcli.store.manifest import (
     MANIFEST,
     MAX_JSON_BYTES,
@@ -109,8 +118,7 @@ class Remote:
             return self.index()
         index = Index(found, {})
         for artefact in found.values():
-            lost = [role for role, holders in index.parents(artefact).items() if not holders]
-            if stored_inputs(artefact.provenance(), lost):
+            if stored_inputs(artefact.provenance(), index.orphaned(artefact)):
                 return self.index()
         return index
 
@@ -246,7 +254,7 @@ class Remote:
         self._fetch([f".keys/{key}"])
         holder = pointed_to(self._layout.keys / key)
         if holder is None or not self._has_manifest(holder):
-            self._write(f".keys/{key}", artefact.id.encode() + b"\n")
+            self._write(f".keys/{key}", pointer_to(artefact.id))
             return None
         return None if holder == artefact.id else holder
 
@@ -256,7 +264,7 @@ class Remote:
         self._fetch([f".names/{name}"])
         holder = pointed_to(self._layout.names / name)
         if holder is None:
-            self._write(f".names/{name}", artefact.id.encode() + b"\n")
+            self._write(f".names/{name}", pointer_to(artefact.id))
         return None if holder in (None, artefact.id) else holder
 
     # The file system

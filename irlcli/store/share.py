@@ -99,8 +99,7 @@ def _with_ancestors(
             if member.id in found:
                 continue
             found[member.id] = member
-            orphaned = [role for role, holders in index.parents(member).items() if not holders]
-            if orphaned:
+            if orphaned := index.orphaned(member):
                 _check_missing(source, member, orphaned, warn)
     return list(found.values())
 
