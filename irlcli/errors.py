@@ -81,7 +81,7 @@ class Interrupted(IrlError):
 
 @contextmanager
 def importing(what: str, module: str) -> Iterator[None]:
-    """Import ``module``, which ``what`` is registered with.
+    """Report that ``module``, which ``what`` is registered with, cannot be imported in the body.
 
     Raises:
         StageFailed: it or what it imports is not installed, or it has no such name.
@@ -104,6 +104,12 @@ def file_failure(error: OSError) -> StageFailed:
 def first_line(error: BaseException) -> str:
     """The first line of any exception's message, or its class if it has none."""
     return (str(error) or type(error).__name__).splitlines()[0]
+
+
+def described(error: BaseException) -> str:
+    """The class of any exception, and the first line of its message if it has one."""
+    name = type(error).__name__
+    return f"{name}: {first_line(error)}" if str(error) else name
 
 
 _KINDS = {

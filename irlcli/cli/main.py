@@ -8,7 +8,15 @@ import sys
 from typing import Any
 
 from irlcli.cli import console
-from irlcli.errors import RETRY, Interrupted, IrlError, StageFailed, UsageError, file_failure
+from irlcli.errors import (
+    RETRY,
+    Interrupted,
+    IrlError,
+    StageFailed,
+    UsageError,
+    described,
+    file_failure,
+)
 
 
 def main() -> None:
@@ -72,10 +80,9 @@ def _main() -> None:
             _fail(_usage(error))
         if _debugging():
             raise
-        text = (str(error) or "no message").splitlines()[0]
         _fail(
             StageFailed(
-                f"unexpected {type(error).__name__}: {text}",
+                f"unexpected {described(error)}",
                 "this is a defect of irl: run again with --debug and report the traceback",
             )
         )

@@ -40,14 +40,15 @@ Layer = tuple[str, Mapping[str, Any]]
 Layers = Sequence[Layer]
 
 
-def check_profile(profile: str) -> None:
-    """Refuse an unknown profile.
+def check_profile(profile: str, source: str = "") -> None:
+    """Refuse an unknown profile, which ``source`` names.
 
     Raises:
         UsageError: not one of :data:`PROFILES`.
     """
     if profile not in PROFILES:
-        raise UsageError(f"unknown profile {profile!r}", suggest(profile, PROFILES))
+        where = f"{source}: " if source else ""
+        raise UsageError(f"{where}unknown profile {profile!r}", suggest(profile, PROFILES))
 
 
 def load_config(
@@ -133,10 +134,8 @@ def in_profile(source: str, tree: Mapping[str, Any], profile: str) -> list[Layer
     tables = {"profiles": profiles}
     if isinstance(profiles, Mapping):
         tables |= {f"profiles.{name}": part for name, part in profiles.items()}
-        if unknown := [name for name in profiles if name not in PROFILES]:
-            raise UsageError(
-                f"{source}: unknown profile {unknown[0]!r}", suggest(unknown[0], PROFILES)
-            )
+        for name in profiles:
+            check_profile(name, source)
     for where, part in tables.items():
         if not isinstance(part, Mapping):
             raise UsageError(

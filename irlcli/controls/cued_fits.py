@@ -55,7 +55,8 @@ class Fitted(NamedTuple):
     """The rewards [V, S, T] of V variants, and their records, [V, S] each.
 
     ``log_likelihood`` is the mean over the settings trained on [nats per episode].
-    ``penalty_before`` is the penalty at the end of the warm-up, ``penalty`` the last one.
+    ``penalty_before`` is the penalty after ``warmup`` iterations, also of a variant without a
+    warm-up, and ``penalty`` the last one.
     """
 
     reward: np.ndarray

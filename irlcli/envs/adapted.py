@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
-from irlcli.errors import StageFailed, UsageError
+from irlcli.errors import StageFailed, UsageError, described
 
 # The largest that the description of a reward or a policy may hold.
 _LARGEST_OBSERVATION = 4096
@@ -111,8 +111,7 @@ class Adapted(gymnasium.Wrapper):
         return found | {"progress": float(progress)} if "progress" in info else found
 
     def _failed(self, method: str, error: BaseException) -> StageFailed:
-        text = (str(error) or "no message").splitlines()[0]
-        return self._wrong(method, f"raised {type(error).__name__}: {text}")
+        return self._wrong(method, f"raised {described(error)}")
 
     def _wrong(self, method: str, what: str) -> StageFailed:
         return StageFailed(

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from irlcli.configs.load import PROFILES, read_toml
+from irlcli.configs.load import check_profile, read_toml
 from irlcli.configs.schema import Config
 from irlcli.envs.code import code_of
 from irlcli.envs.registry import BUILT_IN
@@ -128,7 +128,10 @@ def from_document(
     )
     if env.max_episode_steps is None or env.actions is None:
         if file is None:
-            raise UsageError(f"{source}: its environment has no time limit or no actions", "")
+            raise UsageError(
+                f"{source}: its environment has no time limit or no actions",
+                "make the artefact again, which records both",
+            )
         from irlcli.envs.registration import observed_of
 
         steps, discrete = observed_of(spec)
@@ -168,8 +171,7 @@ def _checked(document: Mapping[str, Any]) -> tuple[_Env, dict[str, _Knob]]:
         if section not in sections:
             raise UsageError(f"unknown section {section!r}", suggest(section, sections))
     for profile in _table(document, "profiles"):
-        if profile not in PROFILES:
-            raise UsageError(f"profiles.{profile}: unknown profile", suggest(profile, PROFILES))
+        check_profile(profile, f"profiles.{profile}")
     if "env" not in document:
         raise UsageError("the section [env] is missing", 'write [env] with id = "module:EnvId"')
     env = _converted(_table(document, "env"), _Env, "env")

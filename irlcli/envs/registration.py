@@ -21,7 +21,7 @@ from irlcli.envs.cue import CueWorld
 from irlcli.envs.own import check_code, module_of
 from irlcli.envs.registry import ENVIRONMENTS, environment
 from irlcli.envs.spec import Code, Cue, EnvironmentSpec, Own
-from irlcli.errors import IrlError, StageFailed, UsageError, importing
+from irlcli.errors import IrlError, StageFailed, UsageError, described, first_line, importing
 from irlcli.interventions import Setting, cue_in, env_kwargs, without_cue
 from irlcli.symmetries import Symmetries
 
@@ -118,7 +118,7 @@ def _require(spec: EnvironmentSpec) -> None:
     except Exception as error:
         # With MUJOCO_GL=osmesa, MuJoCo raises an AttributeError where OSMesa is missing.
         raise StageFailed(
-            f"{spec.name} needs {spec.needs.name}, which cannot be imported: {_line(error)}",
+            f"{spec.name} needs {spec.needs.name}, which cannot be imported: {first_line(error)[:300]}",
             "check its installation and its environment variables; --debug shows where it fails",
         ) from error
 
@@ -161,13 +161,12 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
         raise
     except (gymnasium.error.UnregisteredEnv, gymnasium.error.DeprecatedEnv) as error:
         raise UsageError(
-            f"{own.source}: env.id: {_line(error)}", "is the id registered?"
+            f"{own.source}: env.id: {first_line(error)[:300]}", "is the id registered?"
         ) from error
     except (Exception, SystemExit) as error:
         given = ", ".join(f"{name}={value!r}" for name, value in keywords.items())
         raise UsageError(
-            f"{where} cannot be made{f' with {given}' if given else ''}: "
-            f"{type(error).__name__}: {_line(error)}",
+            f"{where} cannot be made{f' with {given}' if given else ''}: {described(error)[:300]}",
             "the environment's own code refuses this; --debug shows where",
         ) from error
 
@@ -187,10 +186,6 @@ def _import(spec: EnvironmentSpec, own: Own) -> None:
             f"{own.source}: {module} changed since this process imported it",
             "run the same command again; in a notebook, restart Python",
         )
-
-
-def _line(error: BaseException) -> str:
-    return (str(error) or "no message").splitlines()[0][:300]
 
 
 register()

@@ -70,8 +70,8 @@ def group_risks(
 ) -> Risks:
     """The risks of ``demos`` under ``grouping``, see :func:`irlcli.learners.grouping.group`.
 
-    ``pooled`` and ``balanced`` make one risk, ``per-setting`` E, ``shuffled`` at most E, dealt out
-    by ``seed``.
+    ``pooled`` and ``balanced`` make one risk, ``per-setting`` E, ``shuffled`` also E, dealt out by
+    ``seed``.
     """
     e, n, _ = settings.shape
     rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
@@ -135,7 +135,7 @@ class RewardNetworks(torch.nn.Module):
             self.offset = torch.nn.Parameter(torch.zeros(len(seeds), 1, 1).double())
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """[R, S] float64 from ``features`` [S, F] float64."""
+        """[R, T] float64 from ``features`` [T, F] float64."""
         if self.hidden == 0:
             return (features @ self.psi).squeeze(-1)
         layer = torch.tanh(features @ self.weight + self.bias)
@@ -180,7 +180,8 @@ class MaxEnt:
         hidden: width of the hidden layer; 0 learns psi of r = psi^T features.
         learning_rate: of RMSProp.
         kinds: [R, E, S], the kind of each state, where the settings look different or runs have
-            different worlds; None: every state is a kind of its own, the same in every setting.
+            different worlds; None: every state is a kind of its own, the same in every setting
+            (T = S).
         penalty_warmup: iterations at lambda = 0. After them the whole objective is divided by
             :func:`irlcli.penalties.loss_divisor`, as the discriminator's is: RMSProp has then adapted
             to the risk's scale.
@@ -225,7 +226,7 @@ class MaxEnt:
         self.records: list[Record] = []
 
     def rewards(self) -> np.ndarray:
-        """The current rewards [R, S] float64."""
+        """The current rewards [R, T] float64."""
         with torch.no_grad():
             return self.networks(self._features).numpy()
 
@@ -305,7 +306,7 @@ class MaxEnt:
         """Iterate until ``iterations`` are done, also those before :meth:`load_state_dict`.
 
         Records every ``record_every`` iterations and the last one, and calls ``after_record``
-        after each of these. Returns the rewards [R, S].
+        after each of these. Returns the rewards [R, T].
 
         Raises:
             ValueError: as :meth:`step`.
@@ -342,6 +343,6 @@ class MaxEnt:
 
 
 def _expert_occupancy(risks: Risks) -> np.ndarray:
-    """rho_E [R, E, S] of each setting's demonstrations, whatever risks they belong to."""
+    """rho_E [R, E, T] of each setting's demonstrations, whatever risks they belong to."""
     share = risks.weights[..., None] * risks.shares
     return np.einsum("rke,rkes->res", share / share.sum(1, keepdims=True), risks.occupancy)

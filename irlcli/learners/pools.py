@@ -70,7 +70,8 @@ def join_pools(pools: Sequence[Pool]) -> Pool:
 class Minibatch:
     """Discriminator samples: every tensor is [E, 2, B] or [E, 2, B, .].
 
-    E counts the strata; label 0 is the policy, label 1 the expert; B samples of each.
+    E counts the risks; label 0 is the policy, label 1 the expert; B samples of each, those of a
+    risk's strata one after the other.
     """
 
     observations: torch.Tensor

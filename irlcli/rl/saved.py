@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from irlcli.envs.adapted import Adapted
 from irlcli.envs.registration import make
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import IntegrityError, UsageError, described
 from irlcli.interventions import Setting
 from irlcli.rl.policy import Policy
 
@@ -118,9 +118,8 @@ def load_saved(
             model = kind.load(io.BytesIO(data), device="cpu", custom_objects=unused)
     except Exception as error:
         # Unpickling raises whatever the pickled objects raise.
-        text = (str(error) or "no message").splitlines()[0][:200]
         raise IntegrityError(
-            f"{name}: stable-baselines3 cannot load it ({type(error).__name__}: {text})",
+            f"{name}: stable-baselines3 cannot load it ({described(error)[:200]})",
             "save it again with the version that is installed here",
         ) from error
     for what, own, theirs in zip(
