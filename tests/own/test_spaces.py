@@ -13,9 +13,11 @@ import pytest
 import irlcli
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs.adapted import Adapted
+from irlcli.envs.registry import resolve
 from irlcli.envs.vector import VectorWorlds
 from irlcli.errors import StageFailed
-from irlcli.rl.rollout import _idle_actions
+from irlcli.interventions import parse_setting
+from irlcli.rl.rollout import roll_out
 from irlcli.store import Store
 
 RANDOM = ("evaluate", "--random", "--env", "cart.toml", "--profile", "smoke", "--quiet")
@@ -129,12 +131,22 @@ def test_an_action_has_the_type_and_the_bounds_of_its_space():
     assert exact.taken.tolist() == [[-0.1, pytest.approx(0.05)]]
 
 
-def test_the_idle_agent_stays_within_the_bounds():
-    space = gymnasium.spaces.Box(
-        np.array([1, -5, -1], np.float32), np.array([5, -2, 1], np.float32)
-    )
-    assert _idle_actions(space, 2).tolist() == [[1, -2, 0]] * 2
-    assert _idle_actions(gymnasium.spaces.Discrete(3), 2).tolist() == [0, 0]
+@pytest.mark.parametrize(
+    ("space", "kind", "action"),
+    [
+        (ACTIONS, "continuous", [0.0]),
+        (f"{SPACES}Box(0.5, 1.0, (1,), np.float32)", "continuous", [0.5]),
+        (f"{SPACES}Box(-1.0, -0.5, (1,), np.float32)", "continuous", [-0.5]),
+        (f"{SPACES}Discrete(3)", "discrete", 0),
+    ],
+)
+def test_the_idle_agent_stays_within_the_bounds(bench, space, kind, action):
+    bench.edit(bench.module, ACTIONS, space)
+    bench.edit(bench.module, FORCE, "float(np.ravel(action)[0])")
+    bench.edit(bench.toml, '"continuous"', f'"{kind}"')
+    env = resolve("cart.toml").name
+    (episode,) = roll_out(env, parse_setting(env, "mass=2x"), "idle", 1, 0, "test")
+    assert all(taken == action for taken in episode.actions.tolist())
 
 
 def test_an_environment_cannot_change_the_action_of_its_caller():
