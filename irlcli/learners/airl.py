@@ -43,6 +43,7 @@ from irlcli.learners.discriminator import (
     discriminator_logits,
     discriminator_loss,
     gradient_penalty,
+    measured,
     penalty_weight_at,
 )
 from irlcli.learners.grouping import Group, Part, apportion, group
@@ -66,8 +67,7 @@ from irlcli.learners.scoring import (
     transformed_reward,
 )
 from irlcli.networks import all_finite
-from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty
-from irlcli.penalties.risk import cross_entropy
+from irlcli.penalties import PenaltyOptions
 from irlcli.seeds import derive
 from irlcli.symmetries import Symmetries
 from irlcli.trajectories import (
@@ -79,9 +79,6 @@ from irlcli.trajectories import (
     transitions,
     world_settings,
 )
-
-# Samples of either label behind each setting's diagnostics.
-_DIAGNOSTIC_SAMPLES = 1024
 
 
 class AIRL:
@@ -269,7 +266,7 @@ class AIRL:
                 "optimised_penalty": float(optimised_penalty),
                 "penalty_weight": weight,
             }
-            for diagnostics in self._diagnostics(current, expert, generator)
+            for diagnostics in measured(self.model, current, expert, config.logit, generator)
         ]
 
     def _normalise(self, observations: Sequence[np.ndarray], index: int) -> None:
@@ -418,39 +415,6 @@ class AIRL:
             ]
 
         return [strata(members) for members in self._groups]
-
-    def _diagnostics(
-        self, current: Sequence[Pool], expert: Sequence[Pool], generator: torch.Generator
-    ) -> list[dict[str, float]]:
-        """Per setting, whatever the grouping, so that methods can be compared.
-
-        The penalty is the unbiased IRMv1 of the logits, whatever this config's is.
-        """
-        found = []
-        risks = [
-            [Stratum(policy, expert_, None, _DIAGNOSTIC_SAMPLES)]
-            for policy, expert_ in zip(current, expert, strict=True)
-        ]
-        with torch.no_grad():
-            batch = sample_minibatch(risks, generator)
-            logits, f = discriminator_logits(self.model, batch, self.config.logit)
-            entropies = cross_entropy(logits)
-            measure, options = discriminator_penalty("irmv1"), PenaltyOptions()
-            for e in range(self._settings):
-                own = slice(e, e + 1)
-                correct = torch.stack([logits[e, 0] < 0, logits[e, 1] > 0]).float()
-                penalty = measure(
-                    Samples(logits[own], f[own], entropies[own], self._weights[:1]), options
-                )
-                found.append(
-                    {
-                        "cross_entropy": float(entropies[e]),
-                        "accuracy": float(correct.mean()),
-                        "mean_abs_logit": float(logits[e].abs().mean()),
-                        "penalty": float(penalty),
-                    }
-                )
-        return found
 
     def _penalty_options(self, weight: float) -> PenaltyOptions:
         return PenaltyOptions(

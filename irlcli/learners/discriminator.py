@@ -10,10 +10,13 @@ from typing import NamedTuple
 
 import torch
 
-from irlcli.learners.pools import Minibatch
+from irlcli.learners.pools import Minibatch, Pool, Stratum, sample_minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
 from irlcli.penalties.risk import cross_entropy
+
+# Samples of either label behind each setting's diagnostics.
+_DIAGNOSTIC_SAMPLES = 1024
 
 
 def discriminator_logits(
@@ -123,3 +126,39 @@ def penalty_weight_at(index: int, weight: float, warmup: int, ramp: int) -> floa
     if index < warmup:
         return 0.0
     return weight * min(1.0, (index - warmup + 1) / max(1, ramp))
+
+
+@torch.no_grad()
+def measured(
+    model: RewardModel,
+    current: Sequence[Pool],
+    expert: Sequence[Pool],
+    form: str,
+    generator: torch.Generator,
+) -> list[dict[str, float]]:
+    """How well the discriminator separates each setting's ``current`` from its ``expert`` samples.
+
+    Per setting, whatever the grouping, so that methods can be compared. The penalty is the unbiased
+    IRMv1 of the logits, whatever the method's is.
+    """
+    risks = [
+        [Stratum(policy, expert_, None, _DIAGNOSTIC_SAMPLES)]
+        for policy, expert_ in zip(current, expert, strict=True)
+    ]
+    logits, f = discriminator_logits(model, sample_minibatch(risks, generator), form)
+    entropies, weights = cross_entropy(logits), torch.ones(1)
+    penalty = discriminator_penalty("irmv1")
+    found = []
+    for e in range(len(risks)):
+        own = slice(e, e + 1)
+        correct = torch.stack([logits[e, 0] < 0, logits[e, 1] > 0]).float()
+        samples = Samples(logits[own], f[own], entropies[own], weights)
+        found.append(
+            {
+                "cross_entropy": float(entropies[e]),
+                "accuracy": float(correct.mean()),
+                "mean_abs_logit": float(logits[e].abs().mean()),
+                "penalty": float(penalty(samples, PenaltyOptions())),
+            }
+        )
+    return found
