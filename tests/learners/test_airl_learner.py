@@ -9,6 +9,8 @@ from msgspec.structs import replace
 from irlcli.configs import ChallengerConfig, PPOConfig
 from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.learners import airl
+from irlcli.learners.discriminator import measured
+from irlcli.learners.pools import Pool
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.loop import LastRound, Training
 from irlcli.rl.worlds import make_worlds
@@ -78,22 +80,32 @@ def test_diagnostics_are_per_true_setting_for_every_grouping(demos, grouping):
     assert rows[0]["cross_entropy"] > rows[1]["cross_entropy"]
 
 
-def test_diagnostics_measure_the_logits(demos, monkeypatch):
-    """The policy's are all -2; every other one of the expert's is 2, the rest -2."""
-    original = airl.discriminator_logits
+def test_diagnostics_measure_the_logits():
+    """f is -2 for every policy's sample, 2 for two of three of the expert's and -2 for the third."""
 
-    def replaced(model, batch, form):
-        _, f = original(model, batch, form)
-        logits = torch.full_like(f, -2.0)
-        logits[:, 1, ::2] = 2.0
-        return 0.0 * f + logits, f
+    def model(observations, *_):
+        return observations[..., 0]
 
-    monkeypatch.setattr(airl, "discriminator_logits", replaced)
-    _, _, rows = updated(demos)
+    def pool(values):
+        rows = torch.tensor(values).reshape(-1, 1)
+        zeros = torch.zeros(len(rows))
+        return Pool(rows, rows, rows, zeros, zeros, torch.arange(len(rows)))
+
+    pools = [pool([-2.0])], [pool([2.0, 2.0, -2.0])]
+    (row,) = measured(model, *pools, "f", torch.Generator().manual_seed(0))
     right, wrong = np.log1p(np.exp([-2.0, 2.0]))
-    for row in rows:
-        assert (row["accuracy"], row["mean_abs_logit"]) == (0.75, 2.0)
-        assert row["cross_entropy"] == pytest.approx(0.75 * right + 0.25 * wrong)
+    # The expert's share of 2 is that of 1024 draws.
+    share = 2.0 * row["accuracy"] - 1.0
+    assert share == pytest.approx(2.0 / 3.0, abs=0.05)
+    assert row["mean_abs_logit"] == 2.0
+    expected = 0.5 * right + 0.5 * (share * right + (1.0 - share) * wrong)
+    assert row["cross_entropy"] == pytest.approx(expected, rel=1e-5)
+    # d BCE / dw at w = 1 is (sigmoid(f) - y) f, for the policy's samples and the expert's.
+    high = 1.0 / (1.0 + np.exp(-2.0))
+    slope = 0.5 * -2.0 * (1.0 - high) + 0.5 * (
+        share * -2.0 * (1.0 - high) + (1.0 - share) * 2.0 * high
+    )
+    assert row["penalty"] == pytest.approx(slope**2, abs=0.02)
 
 
 def observed(demos):
@@ -132,8 +144,7 @@ def test_every_round_draws_other_samples(demos, monkeypatch):
     rollouts = trainer.train_round(0, learner)
     for index in range(2):
         learner.update(index, rollouts, trainer.policy)
-    # Of each round a minibatch and the samples of its diagnostics.
-    first, _, second, _ = drawn
+    first, second = drawn
     assert first.shape == second.shape and not torch.equal(first, second)
 
 
@@ -176,10 +187,9 @@ def test_every_grouping_draws_as_many_samples(demos, monkeypatch):
     original = airl.discriminator_logits
     for grouping in ("pooled", "balanced", "per-setting", "shuffled"):
 
-        def spy(model, batch, grouping=grouping):
-            if batch.log_probs.shape[-1] < 1000:
-                sizes.setdefault(grouping, batch.log_probs.numel())
-            return original(model, batch)
+        def spy(model, batch, form, grouping=grouping):
+            sizes.setdefault(grouping, batch.log_probs.numel())
+            return original(model, batch, form)
 
         monkeypatch.setattr(airl, "discriminator_logits", spy)
         updated(demos, grouping=grouping)
