@@ -47,7 +47,7 @@ def test_what_a_method_trains_has_its_name(name):
     assert request.label.startswith(f"train-airl {name} ")
 
 
-@pytest.mark.parametrize("name", [name for name, _ in maxent_methods("")])
+@pytest.mark.parametrize("name", [name for name, _ in maxent_methods()])
 def test_what_a_method_trains_with_maxent_has_its_name(name):
     maxent = load_config(MAZE, "smoke", flags=fields(name, "maxent")).maxent
     request = train_maxent.request(DEMOS, MAZE, PATHS, [], maxent)
