@@ -222,6 +222,9 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Adversarial IRL (paper Sec. 4.3, Algorithm 1, App. C).
 
+    Unset fields are in no key, so that rewards made before they existed keep their keys;
+    :data:`UNSET_MEANS` has what they mean.
+
     Attributes:
         learner: a key of :data:`irlcli.learners.LEARNERS`.
         grouping: which demonstrations share a risk. ``pooled``: all, by count of episodes. ``balanced``: all,
@@ -249,22 +252,19 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         actions: what g and log pi see: the policy's samples (``sampled``), or what the environment
             clips them to (``executed``).
         bc_epochs: epochs of behavioural cloning before the first round.
-        dropout: probability that a hidden unit of the discriminator is left out of an update. Unset
-            is none, and in no key, so that rewards made before this field existed keep their keys.
+        dropout: probability that a hidden unit of the discriminator is left out of an update.
         columns: the entries of the observation that the reward sees, as indices; negative ones count
-            from the end. The policy sees all. Unset (or empty) is all, and in no key.
+            from the end. The policy sees all. Empty is all.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
             spaced as ``averaged_by`` says, up to the last. They begin with the first, so a penalised
-            method's mean includes rounds of the penalty's warm-up. Unset (or 1) is the last g alone,
-            and in no key.
+            method's mean includes rounds of the penalty's warm-up. 1 is the last g alone.
         averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
             the discriminator's ``learning-rate``, so that early rounds count more when it falls.
-            Unset is ``rounds``, and in no key.
         plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is
             near chance and has not risen for so many rounds, those of the penalty's warm-up and ramp
-            not counted (:mod:`irlcli.learners.stopping`). Unset trains to the end, and is in no key.
+            not counted (:mod:`irlcli.learners.stopping`). Unset: training takes all steps.
         symmetries: the discriminator sees images of its samples under the environment's symmetries, see
-            :mod:`irlcli.learners.images`. Unset is false, and in no key.
+            :mod:`irlcli.learners.images`.
         select: the round that is kept: ``last``, the best on held-out ``episodes``, or the best in
             one setting (``leg-length=1x``), which is left out of training. Scored every
             ``select_every`` rounds, a setting over ``select_episodes``.
