@@ -27,7 +27,7 @@ def groupings() -> list[str]:
     """Ways to group demonstrations."""
     from typing import get_args
 
-    from irlcli.configs.schema import Grouping
+    from irlcli.configs.fields import Grouping
 
     return list(get_args(Grouping))
 

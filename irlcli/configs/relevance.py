@@ -9,15 +9,8 @@ from collections.abc import Iterable
 from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
-from irlcli.configs.schema import (
-    ADAM_EPS,
-    AIRLConfig,
-    Config,
-    MaxEntConfig,
-    PPOConfig,
-    SACConfig,
-    TransferConfig,
-)
+from irlcli.configs.exact import MaxEntConfig
+from irlcli.configs.schema import ADAM_EPS, AIRLConfig, Config, PPOConfig, SACConfig, TransferConfig
 from irlcli.errors import UsageError, suggest
 from irlcli.learners import LEARNERS
 from irlcli.penalties import PENALTIES, check_penalty

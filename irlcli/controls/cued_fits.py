@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from irlcli.configs.schema import CuedMapsConfig
+from irlcli.configs.exact import CuedMapsConfig
 from irlcli.controls.cued_maps import (
     Judgement,
     Maps,

@@ -9,19 +9,18 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 
-from irlcli.configs.schema import (
+from irlcli.configs.exact import GridworldConfig, MaxEntConfig
+from irlcli.configs.fields import (
     Activation,
-    AIRLConfig,
     Columns,
     Discount,
     Finite,
-    GridworldConfig,
-    MaxEntConfig,
     Members,
     Positive,
     Quantile,
     Widths,
 )
+from irlcli.configs.schema import AIRLConfig
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError, first_line
 from irlcli.interventions import parse_setting

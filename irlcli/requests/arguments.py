@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 
-from irlcli.configs.schema import NonNegative
+from irlcli.configs.fields import NonNegative
 from irlcli.envs.registry import environment, resolve
 from irlcli.errors import UsageError, suggest
 from irlcli.interventions import (

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import msgspec
 
 from irlcli.configs import Config
+from irlcli.configs.fields import Activation, Finite, Widths
 from irlcli.configs.relevance import relevant_ppo
-from irlcli.configs.schema import Activation, CloneConfig, Finite, Widths
+from irlcli.configs.schema import CloneConfig
 from irlcli.envs.registry import environment
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.stages.base import (

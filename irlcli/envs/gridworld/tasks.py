@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from irlcli import tabular
-from irlcli.configs.schema import GridworldConfig
+from irlcli.configs.exact import GridworldConfig
 from irlcli.envs.gridworld import env as gridworld
 from irlcli.errors import UsageError
 from irlcli.interventions import env_kwargs, parse_setting
