@@ -151,7 +151,8 @@ def examples_of(knob: Knob) -> str:
 
 def _allowed(knob: Knob) -> str:
     """The range of a knob: ``must be 0 or 1``, ``must be 0, 1, 2 or 3``, ``must be between 0.1 and 8``."""
-    low, high = _format(knob.low), _format(knob.high)
+    times = "x" if "absolute" not in knob.forms and "multiplier" in knob.forms else ""
+    low, high = _format(knob.low) + times, _format(knob.high) + times
     if not knob.whole:
         return f"must be between {low} and {high}"
     if not knob.high - knob.low < 10:

@@ -21,3 +21,42 @@ class Symmetries(NamedTuple):
     observations: np.ndarray
     actions: np.ndarray
     quaternion: slice | None = None
+
+
+def check_group(found: object, observation_size: int, action_size: int) -> None:
+    """Check what an environment's author declares: K maps of D and of A numbers that form a group.
+
+    Raises:
+        ValueError: what is wrong.
+    """
+    if not isinstance(found, Symmetries):
+        raise ValueError(f"expected irlcli.symmetries.Symmetries, not {type(found).__name__}")
+    count = len(found.observations)
+    for name, maps, size in (
+        ("observations", found.observations, observation_size),
+        ("actions", found.actions, action_size),
+    ):
+        if maps.shape != (count, size, size) or maps.dtype != np.float32:
+            raise ValueError(
+                f"{name} must be float32 {[count, size, size]}, not {maps.dtype} {list(maps.shape)}"
+            )
+        if not np.array_equal(maps[0], np.eye(size)):
+            raise ValueError(f"the first map of {name} is not the identity")
+    for first in range(count):
+        for second in range(count):
+            products = [maps[first] @ maps[second] for maps in found[:2]]
+            if not any(_same(found, k, products) for k in range(count)):
+                raise ValueError(f"map {first} after map {second} is none of the maps: no group")
+
+
+def _same(group: Symmetries, element: int, products: list[np.ndarray]) -> bool:
+    """Whether ``products`` are the maps of ``element``, up to the sign of the quaternion."""
+    observations, actions = products
+    signs = (1.0, -1.0) if group.quaternion is not None else (1.0,)
+    for sign in signs:
+        signed = observations.copy()
+        if group.quaternion is not None:
+            signed[group.quaternion] *= sign
+        if np.allclose(signed, group.observations[element], atol=1e-4):
+            return np.allclose(actions, group.actions[element], atol=1e-4)
+    return False

@@ -4,6 +4,7 @@ The files are those of docs/extending.md; the line is an entry of the registry t
 """
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -38,8 +39,6 @@ def lab(tmp_path, monkeypatch):
         return package / name
 
     yield write
-    import sys
-
     for module in [m for m in sys.modules if m == "lab" or m.startswith("lab.")]:
         del sys.modules[module]
 
@@ -146,6 +145,35 @@ def test_an_environment(irl, lab, tmp_path, monkeypatch):
         done = irl(*arguments)
         assert done.code == 0, done.err
     assert "slide drag=0.9" in done.err
+
+
+def test_an_environment_with_symmetries(irl, lab, tmp_path, monkeypatch):
+    lab("slide.py")
+    written = lab("slide_symmetries.py")
+    (tmp_path / "slide.toml").write_text(example("slide.toml"))
+    monkeypatch.setattr("irlcli.configs.load.settings_directory", lambda: tmp_path)
+    from lab.slide import SPEC
+
+    spec = SPEC._replace(symmetries="lab.slide_symmetries:symmetries")
+    monkeypatch.setitem(registry.ENVIRONMENTS, spec.name, spec)
+    common = ["--store", tmp_path / "runs", "--profile", "smoke", "--quiet"]
+    demos = ["collect-experts", "--env", "slide", "--intervention", "drag", "--name", "demos"]
+    train = ["train-airl", "--demos", "demos", "--method", "erm", "--set", "airl.logit=f"]
+    made = []
+    for words in (demos, train, [*train, "--set", "airl.symmetries=true"]):
+        done = irl(*words, *common)
+        assert done.code == 0, done.err
+        made.append(done.out.strip())
+    assert len({(Path(at) / "reward.pt").read_bytes() for at in made[1:]}) == 2
+    assert "PASS  its symmetries are a group" in irl("envs", "check", "slide").out
+    # Two slides that are no group.
+    written.write_text(written.read_text().replace("-1.0", "-2.0"))
+    del sys.modules["lab.slide_symmetries"]
+    done = irl(*train, *common, "--set", "airl.symmetries=true", "--seed", 1)
+    assert done.code == 1
+    assert "lab.slide_symmetries:symmetries" in done.err and "no group" in done.err
+    done = irl("envs", "check", "slide")
+    assert done.code == 1 and "no group" in done.out
 
 
 def test_a_stage(lab, store_copy):

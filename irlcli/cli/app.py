@@ -81,7 +81,10 @@ def _refuse_repeated(command: Any, args: list[str]) -> None:
         if option.param_type_name != "option" or option.multiple or option.is_flag:
             continue
         if sum(given.count(flag) for flag in option.opts) > 1:
-            raise UsageError(f"{option.opts[0]} is given twice", f"give {option.opts[0]} once")
+            hint = f"give {option.opts[0]} once"
+            if option.opts[0] == "--intervention":
+                hint += "; combine knobs in a setting: --setting KNOB=VALUE,KNOB=VALUE"
+            raise UsageError(f"{option.opts[0]} is given twice", hint)
 
 
 def _load(name: str) -> Any:

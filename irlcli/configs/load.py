@@ -447,6 +447,8 @@ def _field_hint(field: str) -> str:
                 return f"{bounds}, for example {_shown(value)}" if known else bounds
     if unset:
         for member in get_args(kind):
+            if member is bool:
+                return "write true, false or none"
             if int in get_args(member):
                 return f"write a whole number from {member.__metadata__[0].ge}, or none"
     if unset or value is None:

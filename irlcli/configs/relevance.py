@@ -188,8 +188,8 @@ def _symmetric(airl: AIRLConfig) -> AIRLConfig:
         return replace(airl, symmetries=UNSET)
     if airl.logit != "f":
         raise UsageError(
-            "airl.symmetries needs logits without log pi: the policy gives an image another one",
-            "--set airl.logit=f, and --set airl.policy_reward to f or g",
+            "airl.symmetries needs airl.logit = f: log pi of an image is not log pi of the sample",
+            "--set airl.logit=f, or --set airl.symmetries=none",
         )
     return airl
 

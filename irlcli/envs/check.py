@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from irlcli.envs.adapted import Adapted, prints_aside
 from irlcli.envs.registration import make
 from irlcli.envs.spec import EnvironmentSpec, Knob
+from irlcli.envs.symmetry import symmetries
 from irlcli.errors import IrlError, first_line
 from irlcli.interventions import Setting, Value, parse_value
 
@@ -49,6 +50,8 @@ def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Ite
         return
     yield _outcome("gymnasium's check_env", partial(_check_env, spec))
     yield _outcome("equal seeds give equal episodes", partial(_check_seeds, spec))
+    if spec.symmetries is not None:
+        yield _outcome("its symmetries are a group", partial(_check_symmetries, spec))
     for name, knob in spec.knobs.items():
         ends = [Setting(((name, value),)) for value in _ends(knob)]
         yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))
@@ -122,6 +125,13 @@ def _check_env(spec: EnvironmentSpec) -> None:
 def _check_seeds(spec: EnvironmentSpec) -> None:
     if not _equal(*(_make(spec, Setting()) for _ in range(2))):
         raise _Wrong("two episodes of the same seed and the same actions differ")
+
+
+def _check_symmetries(spec: EnvironmentSpec) -> None:
+    with closing(make(spec.name, Setting())) as world:
+        assert world.observation_space.shape is not None
+        actions = gymnasium.spaces.flatdim(world.action_space)
+        symmetries(spec.name, [Setting()], world.observation_space.shape[0], actions)
 
 
 def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting]) -> None:

@@ -6,7 +6,7 @@ Gymnasium 1 has no plugin entry points. Import this module to register the envir
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pkgutil import resolve_name
@@ -23,7 +23,6 @@ from irlcli.envs.registry import ENVIRONMENTS, environment
 from irlcli.envs.spec import Code, Cue, EnvironmentSpec, Own
 from irlcli.errors import IrlError, StageFailed, UsageError, described, first_line, importing
 from irlcli.interventions import Setting, cue_in, env_kwargs, without_cue
-from irlcli.symmetries import Symmetries
 
 # What this process imported, as it was then: Python imports a module once.
 _imported: dict[str, Code] = {}
@@ -197,11 +196,3 @@ def transition_reward(env: str) -> Callable[..., np.ndarray] | None:
     if name is None:
         return None
     return resolve_name(name)
-
-
-def symmetries(env: str, settings: Sequence[Setting]) -> Symmetries:
-    """The symmetries of ``env`` that hold in each of ``settings``."""
-    place = environment(env).symmetries
-    assert place is not None
-    found: Symmetries = resolve_name(place)([env_kwargs(env, setting) for setting in settings])
-    return found

@@ -263,7 +263,11 @@ def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluatio
     """
     artefact = store.resolve(ref).artefact
     if artefact is None or artefact.manifest.record.stage != "evaluate":
-        raise UsageError(f"{ref!r} is not an evaluation", "name artefacts of `irl evaluate`")
+        found = "a file" if artefact is None else f"of {artefact.manifest.record.stage}"
+        raise UsageError(
+            f"{ref!r} is not an evaluation: it is {found}",
+            "name the id that `irl evaluate` printed, or the name that `irl evaluate --name` gave",
+        )
     return artefact, summary(store, artefact)
 
 

@@ -128,7 +128,7 @@ class Lookup:
         if found is not None:
             return Step("FOUND", label, f"in {found.store.root}", found.artefact, key)
         if self.store.has_checkpoint(key):
-            why = "a checkpoint exists: the run was interrupted, or another process is working"
+            why = "a checkpoint exists: an earlier run was interrupted, or one is running now"
             return Step("RESUME", label, why, key=key)
         return Step("RUN", label, f"no artefact has the key {key[:12]}", key=key)
 

@@ -11,7 +11,7 @@ from irlcli.configs import Config, GridworldConfig
 from irlcli.data.descriptions import MOST_EPISODES
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, parse_setting
+from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.stages import train_expert
 from irlcli.stages.base import (
     EnvironmentKey,
@@ -73,10 +73,11 @@ def request(
     Outputs ``steps.parquet``, ``episodes.parquet`` and ``summary.json``.
 
     Raises:
-        UsageError: counts that do not fit the settings, an expert of another one or of a tabular
-            environment, or a ``.zip`` without ``trust``.
+        UsageError: counts that do not fit the settings, settings with different observations, an
+            expert of another one or of a tabular environment, or a ``.zip`` without ``trust``.
     """
     _check_experts(env, settings, experts or {}, trust)
+    check_observed(env, [str(settings[0])], settings[1:])
     counts = tuple(episodes) if episodes else (config.demonstrations.episodes,)
     if len(counts) == 1:
         counts *= len(settings)

@@ -83,9 +83,10 @@ def request(
             f"airl.ppo.n_envs = {airl.ppo.n_envs}: the worlds cannot be shared equally by {trained} settings",
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
-    relevant = relevant_airl(airl, environment(env).discrete_actions)
-    if relevant.symmetries is True and environment(env).symmetries is None:
-        raise UsageError(f"airl.symmetries: {env} has none", "omit airl.symmetries")
+    spec = environment(env)
+    if airl.symmetries is True and spec.symmetries is None:
+        raise UsageError(f"airl.symmetries: {env} has no symmetries", "--set airl.symmetries=none")
+    relevant = relevant_airl(airl, spec.discrete_actions)
     _check_rounds(relevant)
     if trained == 1:
         relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))
@@ -298,24 +299,22 @@ def _learner(
             observation_size=size,
             actions=actions,
             seed=p.seed,
-            symmetries=_symmetries(p, settings),
+            symmetries=_symmetries(p, settings, size, actions.size),
         )
     except ValueError as error:
         raise IntegrityError(f"{env}: {error}") from None
 
 
-def _symmetries(p: Parameters, settings: Sequence[str]) -> Symmetries | None:
-    from irlcli.envs.registration import symmetries
+def _symmetries(
+    p: Parameters, settings: Sequence[str], observation_size: int, action_size: int
+) -> Symmetries | None:
+    from irlcli.envs.symmetry import symmetries
 
     if p.airl.symmetries is not True:
         return None
     env = p.environment.name
-    found = symmetries(env, [parse_setting(env, text) for text in settings])
-    if len(found.actions) == 1:
-        raise UsageError(
-            f"airl.symmetries: {env} has none in {', '.join(settings)}", "omit airl.symmetries"
-        )
-    return found
+    parsed = [parse_setting(env, text) for text in settings]
+    return symmetries(env, parsed, observation_size, action_size)
 
 
 def _selector(

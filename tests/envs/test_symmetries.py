@@ -5,6 +5,7 @@ import pytest
 
 from irlcli.envs.ant.env import Ant
 from irlcli.envs.ant.symmetries import symmetries
+from irlcli.symmetries import Symmetries, check_group
 from tests.envs.bullet_robots import body, pybullet
 
 SQUARE = [{"friction": (2.0, 0.6, 0.6)}, {"mass": 2.0}, {}]
@@ -87,3 +88,49 @@ def test_images_form_a_group(settings):
 )
 def test_only_what_holds_in_every_setting_is_a_symmetry(settings, count):
     assert len(symmetries(settings).observations) == count
+
+
+@pytest.mark.parametrize("settings", [SQUARE, [LONG_LEGS], [GOAL], [GOAL | LONG_LEGS]], ids=str)
+def test_the_ants_symmetries_pass_the_check(settings):
+    group = symmetries(settings)
+    check_group(group, group.observations.shape[-1], 8)
+
+
+def broken(**changes):
+    """The group of a point on a line, (x, v) and one action, with one thing wrong."""
+    parts = {
+        "observations": np.array([np.eye(2), -np.eye(2)], np.float32),
+        "actions": np.array([[[1.0]], [[-1.0]]], np.float32),
+    }
+    return Symmetries(**(parts | changes))
+
+
+QUARTER = np.array([[0.0, 1.0], [-1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (broken(), None),
+        ([np.eye(2)], "not list"),
+        (broken(observations=np.array([np.eye(2), -np.eye(2)])), "not float64"),
+        (broken(observations=np.ones((2, 3, 3), np.float32)), "not float32 [2, 3, 3]"),
+        (broken(actions=np.ones((1, 1, 1), np.float32)), "not float32 [1, 1, 1]"),
+        (broken(actions=-np.ones((2, 1, 1), np.float32)), "first map of actions"),
+        (broken(observations=np.array([np.eye(2), QUARTER], np.float32)), "no group"),
+        (broken(actions=np.array([[[1.0]], [[2.0]]], np.float32)), "no group"),
+        # Twice a quarter turn is the identity up to the sign of a quaternion.
+        (
+            broken(observations=np.array([np.eye(2), QUARTER], np.float32), quaternion=slice(2)),
+            None,
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_what_is_declared_must_be_a_group_of_maps_of_the_right_size(found, said):
+    if said is None:
+        check_group(found, 2, 1)
+        return
+    with pytest.raises(ValueError, match=r".") as caught:
+        check_group(found, 2, 1)
+    assert said in str(caught.value)

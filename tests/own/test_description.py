@@ -137,7 +137,7 @@ WRONG = [
         'id = ["1x", "20x"]',
         2,
         "mass='20x' is out of range",
-        "between 0.1 and 10",
+        "between 0.1x and 10x",
     ),
     ("[interventions.mass]", "[interventions.wind]", 2, "no intervention 'wind'", "mass"),
     ("[airl.ppo]", "[airl.pop]", 2, "unknown field 'airl.pop'", "ppo"),
