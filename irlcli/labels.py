@@ -180,3 +180,10 @@ def _joined(parts: Sequence[Any]) -> str:
     if not text.isprintable():
         text = "".join(c if c.isprintable() else "?" for c in text)
     return text[:_MAX_LENGTH]
+
+
+def duration(seconds: float) -> str:
+    """``1:02:03`` (hours) or ``2:03`` (minutes)."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -76,9 +76,9 @@ def test_training_goes_on_when_a_simulation_becomes_unstable(tmp_path, irl, monk
     ("setting", "said"),
     [
         ("mass=0x", "mass=0x' is out of range"),
-        ("mass=-1x", "between 0.1 and 10"),
+        ("mass=-1x", "between 0.1x and 10x"),
         ("mass=2", "takes mass as multiplier"),
-        ("leg-length=4x", "between 0.2 and 3"),
+        ("leg-length=4x", "between 0.2x and 3x"),
         ("terminate-when-unhealthy=0.5", "is not a whole number"),
         ("bounce=1", "no intervention 'bounce'"),
     ],

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from irlcli.errors import IrlError, UsageError
+from irlcli.labels import duration
 
 if TYPE_CHECKING:
     from irlcli.store import Artefact
@@ -306,13 +307,6 @@ def print_error(error: IrlError, as_json: bool) -> None:
 def _shortened(text: str, most: int) -> str:
     """``text`` without its middle if it is longer than ``most`` characters."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
-
-
-def duration(seconds: float) -> str:
-    """``1:23`` or ``1:02:03``."""
-    minutes, seconds = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
 
 
 def _require_tensorboard(directory: Path) -> None:

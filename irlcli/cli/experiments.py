@@ -16,7 +16,7 @@ from irlcli.cli.options import planning_command, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
-from irlcli.requests.tables import Choice, open_plan, steps_of
+from irlcli.requests.tables import Choice, check_tag, open_plan, steps_of
 
 if TYPE_CHECKING:
     from irlcli.experiments.execute import Outcome
@@ -87,6 +87,7 @@ def plan(
         raise UsageError("--to prints no JSON", "omit --json or --to")
     choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     found = open_plan(session, choice)
+    check_tag(session, choice)
     if to is None:
         _print_plan(session, choice, found)
         return
@@ -204,7 +205,8 @@ def run(
     )
     if status + cancel + detach > 1:
         raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
-    _check_options(session, choice, directory, options, "status" * status + "cancel" * cancel)
+    about_jobs = "status" * status + "cancel" * cancel
+    _check_options(session, choice, directory, options, about_jobs, detach)
     options.check_used(detach)
     if session.dry_run and (status or cancel):
         raise UsageError(
@@ -245,6 +247,7 @@ def _check_options(
     directory: Path | None,
     options: ClusterOptions,
     about_jobs: str,
+    detach: bool,
 ) -> None:
     """Refuse options that contradict each other, or would be ignored, before any work.
 
@@ -253,12 +256,7 @@ def _check_options(
     Raises:
         UsageError: names them.
     """
-    other = session.file or session.overrides or choice.choose_penalty is not None
-    if choice.tag is None and other:
-        raise UsageError(
-            "results with --settings, --set or --choose-penalty need names of their own",
-            "add --tag NAME",
-        )
+    check_tag(session, choice)
     if choice.only is not None and (choice.until or directory or options.jobs):
         raise UsageError("--only takes no --until, --out or --jobs", "omit them: it makes one step")
     if about_jobs and (directory or options.jobs):
@@ -267,6 +265,8 @@ def _check_options(
         raise UsageError("--until makes no report, so --out has no files", "omit one of them")
     if choice.only is not None and options.cluster is not None:
         raise UsageError("--only cannot be combined with --cluster", "omit one of them")
+    if detach and directory is not None:
+        raise UsageError("--detach makes no report, so --out has no files", "omit one of them")
     if directory is not None:
         check_out(directory, session.store.root)
 

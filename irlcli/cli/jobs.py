@@ -4,8 +4,9 @@ import re
 import time
 from typing import Any
 
-from irlcli.cli.console import TerminalConsole, duration
+from irlcli.cli.console import TerminalConsole
 from irlcli.experiments.failures import Failure
+from irlcli.labels import duration
 
 _PLAIN_SECONDS = 60.0
 

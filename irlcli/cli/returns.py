@@ -25,7 +25,7 @@ def print_rows(evaluations: Sequence[Measured], stderr: bool = False) -> None:
         "learned return": [row.learned for row in found],
         "progress": [row.progress for row in found],
     }
-    for place, (column, values) in zip((4, 3), optional.items(), strict=True):
+    for place, (column, values) in zip((4, 4), optional.items(), strict=True):
         if any(value is not None for value in values):
             columns.insert(place, column)
             for cells, value in zip(table, values, strict=True):

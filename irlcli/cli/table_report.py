@@ -10,7 +10,7 @@ from irlcli.cli import console as out
 from irlcli.cli.session import StageSession
 from irlcli.errors import NotFound, StageFailed, UsageError
 from irlcli.report.tables import EVERY_CELL
-from irlcli.requests.tables import Choice
+from irlcli.requests.tables import Choice, needs_tag
 from irlcli.store import Artefact, read_json
 
 if TYPE_CHECKING:
@@ -47,8 +47,7 @@ def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":
 
 def _run_line(session: StageSession, choice: Choice) -> str:
     """The command line that makes what a report on ``choice`` lacks, for a hint."""
-    other = session.file or session.overrides or choice.choose_penalty is not None
-    tag = ["--tag", "NAME"] if other else []
+    tag = ["--tag", "NAME"] if needs_tag(session, choice) else []
     return session.suggestion("run", choice.table, *choice.words(), *tag)
 
 
@@ -113,8 +112,8 @@ def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:
         others = other_versions({"libraries": versions})
         if others:
             session.console.warn(
-                f"{out.counted(names.count(name), 'artefact')} of this report made with other library "
-                f"versions: {', '.join(others)}"
+                f"{out.counted(names.count(name), 'artefact')} of this report: made with other "
+                f"library versions: {', '.join(others)}"
             )
 
 

@@ -93,7 +93,7 @@ def _members(place: str, config: Config, policies: Policies) -> Iterator[_Member
     if policies.student is not None:
         yield _Member("student", "student", policies.student)
     for trained, expert in policies.reused.items():
-        # Where one expert demonstrates everywhere, it is nothing beside the setting's own.
+        # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         if trained != place and expert != policies.experts.get(place):
             yield _Member(f"expert of {trained}", "reused", expert)
     if place in policies.experts:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol
 
+from irlcli.errors import Interrupted
 from irlcli.experiments.failures import LAST_LINES, Failure, failure
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.runner import Runner
@@ -181,11 +182,11 @@ class Execution:
                 continue
             status = self._plan.step(name).status
             if status == "HIT":
-                self._finish(name)
+                self._take(name)
                 self._outcome.existed.append(name)
                 self._display.done(name, 0.0)
             elif status == "FOUND" and self._copy(name):
-                self._finish(name)
+                self._take(name)
                 self._outcome.copied.append(name)
             else:
                 self._waiting.remove(name)
@@ -216,11 +217,18 @@ class Execution:
             why = Failure(1, "its process ended, but the artefact is missing", "")
         else:
             why = child.failure()
-        if self._signals:
+        code = child.process.returncode
+        if self._signals and (code < 0 or code in (0, Interrupted.exit_code)):
             self._waiting.append(child.name)
             return
         self._outcome.failed[child.name] = why
         self._display.failed(child.name, why)
+
+    def _take(self, name: str) -> None:
+        """Finish a step that another run, or another store, has made."""
+        self._finish(name)
+        if self._plan.chooses(name):
+            self._plan.refresh()
 
     def _finish(self, name: str) -> None:
         if name in self._waiting:

@@ -69,8 +69,12 @@ def tensor_file(
         )
     output = resolved.output or _only(artefact, f"{kind}.pt")
     if output != f"{kind}.pt":
+        holds = any(o.path == f"{kind}.pt" for o in artefact.manifest.outputs)
         raise UsageError(
-            f"{ref!r} is {output}, not a {kind}", f"name {artefact.id}/{kind}.pt or the artefact"
+            f"{ref!r} is {output}, not a {kind}",
+            f"name {artefact.id}/{kind}.pt or the artefact"
+            if holds
+            else f"its artefact holds no {kind}; {store.listing}",
         )
     source = source_of(Resolved(artefact, artefact.directory / output))
     path = store.open(artefact, _only(artefact, f"{kind}.json"))
@@ -182,7 +186,7 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
     introduce(artefact)
     record = artefact.manifest.record
     if record.stage not in ("collect-experts", "import") or resolved.output is not None:
-        what = resolved.output or f"a {record.stage} artefact"
+        what = resolved.output or f"an artefact of {record.stage}"
         raise UsageError(
             f"{ref!r} is {what}, not a dataset of demonstrations",
             "name an artefact of `irl collect-experts` or `irl import`",
@@ -263,7 +267,11 @@ def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluatio
     """
     artefact = store.resolve(ref).artefact
     if artefact is None or artefact.manifest.record.stage != "evaluate":
-        found = "a file" if artefact is None else f"of {artefact.manifest.record.stage}"
+        found = (
+            "a path outside the store"
+            if artefact is None
+            else f"an artefact of {artefact.manifest.record.stage}"
+        )
         raise UsageError(
             f"{ref!r} is not an evaluation: it is {found}",
             "name the id that `irl evaluate` printed, or the name that `irl evaluate --name` gave",

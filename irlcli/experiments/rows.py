@@ -250,7 +250,7 @@ def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator
         if in_distribution:
             name, request = requests.own_returns(e)
             yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
-        # Where one expert demonstrates everywhere, it is nothing beside the setting's own.
+        # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         reused = (("ood", unseen), ("id", trained)) if expert != requests.expert(unseen[0]) else ()
         for measure, places in reused:
             if measure == "ood" or in_distribution:
@@ -371,8 +371,7 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Retrained]]) -
         owner = run.name if own else run.shared
         # The sign stays: it tells the expert of goal-y=-900 from that of goal-y=900.
         policy = re.sub(r"[ ,:]+", "-", entry.policy.replace(f"{row.knob}=", ""))
-        place = entry.setting.partition("=")[2].replace(":", "_")
-        yield Task(f"{owner}.bank.{policy}.{place}", "returns", recorded)
+        yield Task(f"{owner}.bank.{policy}.{_value(entry.setting)}", "returns", recorded)
     request = assess.request(From(reward.learned, "reward.pt"), row.env, members, reward.label)
     yield Task(f"{run.name}.assess", "returns", request, reward.cell(ASSESS))
 
@@ -428,7 +427,7 @@ def _choice(name: str, choice: Request) -> Iterator[Task]:
     """The choice of lambda, after the rewards learned for it and what their students earn."""
     for measured in map(made_by, choice.inputs.values()):
         learned = made_by(measured.inputs["policy"])
-        left_out = measured.parameters.settings[0].partition("=")[2].replace(":", "_")
+        left_out = _value(measured.parameters.settings[0])
         weight = repr(learned.parameters.airl.penalty_weight).removesuffix(".0").replace("+", "")
         trial = f"{name}.{weight}.without-{left_out}"
         yield Task(trial, "rewards", learned)
@@ -459,6 +458,6 @@ def made_by(source: Source | From) -> Request:
     return source.request
 
 
-def _value(setting: Setting) -> str:
+def _value(setting: Setting | str) -> str:
     """A setting's value as a part of a name."""
     return str(setting).partition("=")[2].replace(":", "_")

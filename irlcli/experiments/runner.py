@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed
+from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed, file_failure
 from irlcli.experiments.introduce import described
 from irlcli.experiments.status import Lookup, Step, checked, key_record, source_in, source_of
 from irlcli.stages.base import Console, From, Job, Request, Source
@@ -82,8 +82,7 @@ def _file_errors_of(label: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise StageFailed(
-            f"{label}: {error.strerror or error}"
-            + (f": {error.filename}" if error.filename else ""),
+            f"{label}: {file_failure(error).message}",
             "No partial output was written. Fix the problem and run the same command again: it "
             "resumes from the last checkpoint, if there is one.",
         ) from error

@@ -123,7 +123,12 @@ class Lookup:
         if there.artefact is not None:
             return Step("HIT", label, str(there.artefact.directory), there.artefact, key)
         if there.problem is not None:
-            return Step("RUN", label, f"{there.problem}: it would be computed again", key=key)
+            return Step(
+                "RUN",
+                label,
+                f"{there.problem}: the next run moves it to quarantine and exits with 4; run again to compute it",
+                key=key,
+            )
         found = self._find_elsewhere(key)
         if found is not None:
             return Step("FOUND", label, f"in {found.store.root}", found.artefact, key)

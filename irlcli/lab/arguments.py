@@ -50,7 +50,9 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
             error.message, error.hint = _in_python(error.message), _in_python(error.hint)
             raise error.with_traceback(None) from None
         except OSError as error:
-            raise file_failure(error) from None
+            failed = file_failure(error)
+            failed.hint = _in_python(failed.hint)
+            raise failed from None
 
     return call
 

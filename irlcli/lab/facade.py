@@ -424,7 +424,9 @@ class Lab:
             None if experiments is None else Path(experiments),
         )
         with self._at_work(configs, [], read_only=True) as session:
-            return PlannedTable(table, planning.steps_of(planning.open_plan(session, chosen)))
+            plan = planning.open_plan(session, chosen)
+            planning.check_tag(session, chosen)
+            return PlannedTable(table, planning.steps_of(plan))
 
     def _session(
         self, configs: Configs, line: Sequence[str], read_only: bool = False

@@ -34,6 +34,11 @@ _NOTE = (
 )
 
 
+def _passed(gate: float) -> str:
+    """The column with the number of seeds that reach ``gate``."""
+    return f"passed_{100 * gate:.0f}"
+
+
 def shares(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """What policies earn of their setting's expert, a row per row, variant, measure, setting, seed.
 
@@ -90,8 +95,7 @@ def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
                     "seeds": s.n,
                     "mean": s.mean,
                     "deviation": s.deviation,
-                    "passed_80": int((values >= 0.8).sum()),
-                    "passed_90": int((values >= 0.9).sum()),
+                    **{_passed(gate): int((values >= gate).sum()) for gate in GATES},
                     "progress": progress.mean(),
                     "student": student.mean(),
                     "difference": (values[common] - base[common]).mean() if compared else None,
@@ -127,7 +131,9 @@ def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Ta
                 r.overrides or "as in settings/",
                 *(_setting(found, row, r.agent, setting) for setting in row.trained),
                 _spread(over_settings(found, row, r.agent, _RETRAINED)),
-                f"{r.passed_80}/{r.seeds}, {r.passed_90}/{r.seeds}" if r.seeds else "-",
+                ", ".join(f"{getattr(r, _passed(gate))}/{r.seeds}" for gate in GATES)
+                if r.seeds
+                else "-",
                 percent(r.progress),
                 _spread(over_settings(found, row, r.agent, _STUDENT)),
                 f"{100 * r.difference:+.1f} ({r.pairs})" if r.pairs else "-",

@@ -10,8 +10,9 @@ import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
 
+from irlcli.labels import duration
 from irlcli.report.drawing import panels, save
-from irlcli.report.lineage import commits, duration
+from irlcli.report.lineage import commits
 from irlcli.report.parameters import Cell, Run
 from irlcli.report.tables import Table, markdown_table
 
@@ -110,7 +111,7 @@ def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float
     sentences = [f"Below their bar, so not yet experts: {', '.join(low)}."] if low else []
     if missing:
         sentences.append(
-            f"Missing: {len(missing)} of {len(experts)} experts: {', '.join(missing)}."
+            f"Missing: the evaluations of {len(missing)} of {len(experts)} experts: {', '.join(missing)}."
         )
     return sentences
 

@@ -55,10 +55,3 @@ def commits(runs: Iterable[Run]) -> list[str]:
 def short(code: Code) -> str:
     """The first ten digits of a commit."""
     return (code.commit or "unknown")[:10]
-
-
-def duration(seconds: float) -> str:
-    """``1:02:03`` (hours) or ``2:03`` (minutes)."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

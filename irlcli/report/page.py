@@ -6,9 +6,10 @@ import json
 from collections.abc import Mapping
 from html import escape
 
+from irlcli.labels import duration
 from irlcli.report.agents import title
 from irlcli.report.build import Report
-from irlcli.report.lineage import commits, duration, evaluations, lineage
+from irlcli.report.lineage import commits, evaluations, lineage
 from irlcli.report.parameters import Parameters
 from irlcli.report.tables import REWARD_QUALITY, Table, latex_table, markdown_table
 from irlcli.report.text import number

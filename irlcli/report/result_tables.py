@@ -9,11 +9,11 @@ import pandas as pd
 from scipy.stats import ttest_ind_from_stats
 
 from irlcli.data.descriptions import Verdict
-from irlcli.labels import steps, steps_of_all_restarts
+from irlcli.labels import duration, steps, steps_of_all_restarts
 from irlcli.report import paper
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
 from irlcli.report.compute import failed_to_imitate
-from irlcli.report.lineage import commits, duration, evaluations, lineage
+from irlcli.report.lineage import commits, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
 from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
 from irlcli.report.text import number, p_value, percent

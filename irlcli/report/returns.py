@@ -15,7 +15,7 @@ from irlcli.report.agents import title
 Measured = tuple[Evaluation, Mapping[str, Any], bool]
 
 _ORDER = ("expert", "student", "transfer", "clone", "random", "idle")
-_HINT = "a row is a sample over seeds: report runs that differ in anything else separately"
+_HINT = "the runs in a row may differ in their seed only: report the others separately"
 
 
 class Row(NamedTuple):
@@ -79,6 +79,12 @@ def rows(evaluations: Iterable[Measured]) -> list[Row]:
                 seeds.append(reward.seed)
             key = (order, agent, policy.env, item.setting)
             if tuple(seeds) in groups.get(key, {}):
+                if seeds == [None]:
+                    raise UsageError(
+                        f"{agent} in {item.setting} appears twice: it is one agent, whatever the "
+                        "seed of its episodes",
+                        "name one evaluation of it",
+                    )
                 which = " under the reward of seed ".join(map(str, seeds))
                 raise UsageError(f"{agent} in {item.setting} has seed {which} twice", _HINT)
             first = parameters_of.setdefault(key, parameters)

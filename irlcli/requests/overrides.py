@@ -22,7 +22,7 @@ def behind(request: Request) -> Iterator[Request]:
 
 
 def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[str]:
-    """A line for each override whose field ``requests`` hold, but none of them its value.
+    """A warning for each override without effect: requests have its field, with another value.
 
     Fields that cannot change a result have one value in every key
     (:mod:`irlcli.configs.relevance`).
@@ -35,12 +35,12 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
         if field.startswith(_OF_STUDENTS):
             retrained = [request for request in made if request.stage.name == "transfer"]
             if retrained and not any("start" in request.inputs for request in retrained):
-                yield f"--set {item} is not used: no policy begins as the student"
+                yield f"--set {item} has no effect: no policy begins as the student"
             continue
         held = {_held(field, each) for each in parameters} - {None}
         if held and _shown(field, value) not in held:
             values = " or ".join(sorted(text for text in held if text))
-            yield f"--set {item} is not used: with the other values it is {values}"
+            yield f"--set {item} has no effect: the other values make it {values}"
 
 
 def _held(field: str, parameters: Any) -> str | None:

@@ -72,6 +72,25 @@ class Choice(NamedTuple):
         ]
 
 
+def needs_tag(session: StageSession, choice: Choice) -> bool:
+    """Whether results need names of their own: their configs are not those of the profile."""
+    other = session.file or session.overrides or choice.choose_penalty is not None
+    return choice.tag is None and bool(other)
+
+
+def check_tag(session: StageSession, choice: Choice) -> None:
+    """Refuse names that are those of other results.
+
+    Raises:
+        UsageError: a tag is missing, see :func:`needs_tag`.
+    """
+    if needs_tag(session, choice):
+        raise UsageError(
+            "results with --settings, --set or --choose-penalty need names of their own",
+            "add --tag NAME",
+        )
+
+
 def open_plan(session: StageSession, choice: Choice) -> "Plan":
     """The plan of the chosen part of a table. The table's settings file becomes the session's.
 
@@ -110,7 +129,8 @@ def open_plan(session: StageSession, choice: Choice) -> "Plan":
     except UsageError as error:
         raise UsageError(f"--tag {tag!r} cannot begin a name", error.hint) from None
     session.table_file = table.settings
-    tag_words = [] if choice.tag is None else ["--tag", choice.tag]
+    named = "NAME" if needs_tag(session, choice) else choice.tag
+    tag_words = [] if named is None else ["--tag", named]
     listing = session.suggestion("plan", choice.table, *choice.words(), *tag_words)
     selection = Selection(tag, candidates, until, choice.only, listing)
     plan = Plan(table, selection, session.config, session.runner().lookup())

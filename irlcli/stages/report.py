@@ -145,7 +145,8 @@ def _write(
 
     p: Parameters = job.parameters
     write_csv(job.output / f"{p.kind}.csv", report.cells)
-    write_csv(job.output / "seeds.csv", report.points)
+    # Baselines have no seed, and a float column would round the others.
+    write_csv(job.output / "seeds.csv", report.points.astype({"seed": "Int64"}))
     write_csv(job.output / "comparisons.csv", report.comparisons)
     if p.variants:
         write_csv(job.output / "variants.csv", report.variants)

@@ -121,21 +121,27 @@ def collect(
         pointers: dict[str, list[Path]] = {}
         for pointer, id16 in claims(layout):
             pointers.setdefault(id16, []).append(pointer)
+        removed = []
         for artefact in artefacts:
+            try:
+                artefact.directory.chmod(0o755)
+            except PermissionError:
+                warn(f"{artefact.directory} belongs to another user, who can remove it")
+                continue
             for pointer in pointers.get(artefact.id, []):
                 pointer.unlink(missing_ok=True)
                 _remove_lock(layout.locks / pointer.name)
             # A unique name: an interrupted gc may have left an earlier, half-removed copy.
             grave = layout.work / f"removed-{artefact.id}-{os.urandom(4).hex()}"
-            artefact.directory.chmod(0o755)
             artefact.directory.rename(grave)
             shutil.rmtree(grave)
+            removed.append(artefact)
         for path in work:
             remove(path)
             _remove_lock(layout.locks / path.name)
         for directory in (layout.root, layout.keys, layout.names, layout.work, layout.locks):
             remove_leftovers(directory)
-        return artefacts, work
+        return removed, work
 
 
 def _remove_lock(path: Path) -> None:

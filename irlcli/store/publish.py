@@ -73,6 +73,7 @@ def _place(layout: Layout, output: Path, manifest: Manifest) -> Artefact:
     while True:
         try:
             output.rename(target)
+            target.chmod(0o555)
             break
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
@@ -83,7 +84,6 @@ def _place(layout: Layout, output: Path, manifest: Manifest) -> Artefact:
             break
         with suppress(FileNotFoundError):
             set_aside(layout, target)
-    target.chmod(0o555)
     fsync_directory(layout.root)
     return Artefact(target, manifest)
 

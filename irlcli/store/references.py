@@ -179,8 +179,8 @@ def check_name(name: str) -> None:
     if not is_name(name):
         raise UsageError(
             f"{name!r} cannot be a name",
-            "use a letter, then letters, digits, '.', '_' or '-'; hexadecimal digits alone would "
-            "read as an id",
+            "use a letter, then up to 99 letters, digits, '.', '_' or '-'; hexadecimal digits alone "
+            "would read as an id",
         )
 
 

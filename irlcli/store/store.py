@@ -88,7 +88,7 @@ class Store:
         """Create the store if it does not exist.
 
         Raises:
-            OSError: the directory is not writable.
+            StageFailed: the directory is not writable, or its file system has no hard links.
         """
         layouts.create(self._writable)
 

@@ -85,15 +85,16 @@ def test_a_failure_stops_only_what_needs_it(runs, tmp_path):
         "local",
         "--jobs",
         "4",
-        *REWARDS,
         code=1,
         IRL_TEST_FAIL="train_airl pooled",
     )
     assert "it was asked to fail" in errors and "hint: do not ask for it" in errors
-    assert f"{ROW}.irm.0" in Store(store).names() and f"{ROW}.erm.0" not in Store(store).names()
-    process = runs.start(store, "--cluster", "local", "--status", *REWARDS, "--json")
-    (left,) = json.loads(process.communicate()[0])["missing"]
-    assert (left["name"], left["state"]) == (f"{ROW}.erm.0", "FAILED")
+    names = Store(store).names()
+    assert f"{ROW}.irm.0.zero-shot-returns" in names and f"{ROW}.erm.0" not in names
+    process = runs.start(store, "--cluster", "local", "--status", "--json")
+    failed, blocked = json.loads(process.communicate()[0])["missing"]
+    assert (failed["name"], failed["state"]) == (f"{ROW}.erm.0", "FAILED")
+    assert blocked["name"] == f"{ROW}.erm.0.zero-shot-returns"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

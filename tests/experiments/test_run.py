@@ -16,10 +16,12 @@ import pytest
 from test_architecture import loaded_by
 
 from irlcli.configs import load_config
-from irlcli.experiments.execute import Outcome
+from irlcli.experiments.execute import Execution, Outcome
 from irlcli.experiments.failures import Failure
-from irlcli.experiments.runner import Runner
+from irlcli.experiments.runner import Runner, Silent
 from irlcli.interventions import parse_settings
+from irlcli.requests.session import StageSession
+from irlcli.requests.tables import Choice, open_plan
 from irlcli.stages import train_expert
 from irlcli.store import Store
 from irlcli.store.sources import open_sources
@@ -299,6 +301,48 @@ def test_lambda_is_chosen_before_the_reward_is_learned(irl, tmp_path, smoke_stor
     assert len(store.names()) == 13  # two experts, demos, four rewards and returns, choice, reward
     planned = irl("plan", *words, "--until", "rewards", "--json")
     assert json.loads(planned.out)["counts"]["HIT"] == 13
+
+
+def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):
+    """Another run chooses lambda 10 while this one trains an expert; the table's own lambda is 1."""
+    tables = tmp_path / "tables.toml"
+    tables.write_text(TABLES.replace('["erm", "irm"]', '["irm"]'))
+    store = Store(tmp_path / "runs")
+    store.create()
+    line = {"profile": "smoke", "file": None, "overrides": [], "sources": [], "command": ["irl"]}
+    session = StageSession(store.root, Silent(), **line)
+    choice = Choice("tiny", choose_penalty="1,10", until="rewards", tag="x", file=tables)
+    plan, others = (open_plan(session, choice) for _ in range(2))
+    reward = "x.lunar-lander.engine-power.irm.0"
+
+    def published(name):
+        record = others.lookup.record(others.tasks[name].request)
+        with store.working_on(record.key, True) as scratch:
+            output = scratch.new_output()
+            for file in ("policy.pt", "reward.pt", "summary.json", "metrics.parquet"):
+                (output / file).write_text(f"{file} of {name}")
+            if others.chooses(name):
+                found = {"env": "lunar-lander", "weights": [1.0, 10.0], "scores": [{}, {}]}
+                (output / "choice.json").write_text(json.dumps(found | {"chosen": 10.0, "ties": 1}))
+            store.publish(record, output, {})
+        others.refresh()
+
+    def command(name):
+        for missing in others.tasks if name != reward else [reward]:
+            if others.step(missing).status != "HIT" and (name == reward or missing != reward):
+                published(missing)
+        return [sys.executable, "-c", ""]
+
+    outcome = Execution(plan, session.runner(), command, 1, Unseen()).run()
+    assert outcome.exit_code == 0 and outcome.made[-1] == reward
+    assert plan.tasks[reward].request.parameters.airl.penalty_weight == 10.0
+
+
+class Unseen:
+    """A display that shows nothing."""
+
+    def __getattr__(self, name):
+        return lambda *arguments: None
 
 
 def test_a_table_end_to_end(irl, smoke_store, tmp_path):

@@ -432,7 +432,7 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
     assert found.loc["bounce=0.9", "stands"] == "train-expert has not run"
     assert pd.isna(found.loc["bounce=0.9", "true_return"])
     (missing,) = caveats(done)
-    assert missing.startswith("Missing: 6 of 9 experts: lunar-lander bounce=0.1")
+    assert missing.startswith("Missing: the evaluations of 6 of 9 experts: lunar-lander bounce=0.1")
     assert (
         "| lunar-lander bounce=0.9 | held out | train-expert has not run |"
         in (directory / "README.md").read_text()

@@ -42,7 +42,7 @@ def plan(irl, tables, tmp_path):
     """``plan(...)``: the steps of the table as JSON, by name without tag and row."""
 
     def run(*more, file=tables):
-        line = ["plan", "parts", "--experiments", file, "--profile", "smoke"]
+        line = ["plan", "parts", "--experiments", file, "--profile", "smoke", "--tag", "smoke"]
         done = irl(*line, "--store", tmp_path / "none", *more, "--json")
         assert done.code == 0, done.err
         steps = json.loads(done.out)["steps"]

@@ -52,7 +52,7 @@ def test_a_setting_has_its_experts_return_and_training():
 @pytest.mark.parametrize(("bar", "low"), [(200.0, 0), (260.0, 1)])
 def test_caveats_name_missing_experts_and_those_below_their_bar(bar, low):
     found = experts.caveats(CELLS, summarised(), {ROW: bar, "lunar-lander friction": 999.0})
-    assert found[-1] == "Missing: 1 of 2 experts: lunar-lander bounce=0.9."
+    assert found[-1] == "Missing: the evaluations of 1 of 2 experts: lunar-lander bounce=0.9."
     assert len(found) == 1 + low
     assert not low or "bounce=0.1 (250 of 260)" in found[0]
 

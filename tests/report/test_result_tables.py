@@ -4,10 +4,10 @@ import msgspec
 import pytest
 from report_examples import BOUNCE, POWER, column, complete, example, metrics, scored, table
 
+from irlcli.labels import duration
 from irlcli.methods import METHODS
 from irlcli.report.agents import colours, title
 from irlcli.report.build import build
-from irlcli.report.lineage import duration
 from irlcli.report.parameters import Cell
 from irlcli.report.tables import latex_table, latex_text, markdown_table
 

@@ -135,3 +135,9 @@ def test_seeds_that_differ_in_more_than_the_seed_are_refused():
     with pytest.raises(UsageError, match=r"differ in train-airl\.airl\.penalty_weight: 1 and 100"):
         rows(students)
     assert len(rows(students[:1])) == 1
+
+
+def test_an_agent_without_a_seed_is_one_agent():
+    twice = [evaluation("random", x, None) for x in (1.0, 2.0)]
+    with pytest.raises(UsageError, match=r"random in bounce=0\.9 appears twice"):
+        rows(twice)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import errno
 import os
 import time
 from pathlib import Path
@@ -119,6 +120,36 @@ def test_collect_refuses_a_store_in_use(empty_store, family):
     assert len(empty_store.ids()) == 5
     removed, _ = empty_store.collect(DAY)
     assert len(removed) == 5
+
+
+def test_another_users_artefacts_are_left(empty_store, family, monkeypatch):
+    """Only their owner may change the mode of a directory, which is read-only."""
+    theirs, *ours = sorted(empty_store.ids())
+    change = Path.chmod
+
+    def chmod(path, mode, **options):
+        if path.name == theirs:
+            raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+        change(path, mode, **options)
+
+    monkeypatch.setattr(Path, "chmod", chmod)
+    said = []
+    empty_store.warn = said.append
+    removed, _ = empty_store.collect(DAY)
+    assert sorted(artefact.id for artefact in removed) == ours
+    assert empty_store.ids() == [theirs] and not empty_store.verify([theirs])
+    assert len(said) == 1 and theirs in said[0]
+    key = empty_store.artefacts()[0].manifest.record.key
+    assert empty_store.find(key) is not None
+
+
+def test_locks_of_a_group_can_be_taken_by_its_members(tmp_path):
+    before = os.umask(0o002)
+    try:
+        with locked(tmp_path / "lock"):
+            assert (tmp_path / "lock").stat().st_mode & 0o777 == 0o664
+    finally:
+        os.umask(before)
 
 
 def test_no_process_uses_the_store_while_it_is_collected(empty_store):

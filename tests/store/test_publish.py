@@ -378,3 +378,15 @@ def test_a_file_system_without_hard_links_is_refused_before_the_work(tmp_path, m
     store = Store(tmp_path / "runs")
     store.create()
     assert [p.name for p in (store.root / ".locks").iterdir()] == ["gc"]
+
+
+def test_what_is_published_again_leaves_the_first_as_it_is(tmp_path):
+    """It may be another user's, killed between its rename and its claim."""
+    store = Store(_created(tmp_path / "runs"))
+    first = attempt(store).artefact
+    (store.root / ".keys" / RECORD.key).unlink()
+    first.directory.chmod(0o755)
+    again = attempt(store)
+    assert again.artefact.id == first.id and again.diverged is None
+    assert first.directory.stat().st_mode & 0o777 == 0o755
+    assert store.find(RECORD.key) is not None

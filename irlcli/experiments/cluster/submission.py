@@ -193,6 +193,9 @@ class Submission:
                 self._outcome.existed.append(name)
             if step.status == "HIT" and step.artefact is not None:
                 self._runner.store.set_name(name, step.artefact)
+        if self._outcome.copied and any(map(self._plan.chooses, self._plan.tasks)):
+            # A copied choice, or one that another run has just made.
+            self._plan.refresh()
 
     def _exists(self, name: str) -> bool:
         return self._plan.step(name).status == "HIT"
@@ -224,7 +227,11 @@ class Submission:
         )
 
     def _any_ready(self) -> bool:
-        return any(self._ready(name) for array in self._waiting for name in array.names)
+        return any(
+            name not in self._ids and self._ready(name)
+            for array in self._waiting
+            for name in array.names
+        )
 
     def _ready(self, name: str) -> bool:
         return all(self._exists(need) for need in self._plan.needs[name])
