@@ -98,7 +98,9 @@ def test_phases_end_a_plan(plan, tmp_path):
 
 
 def test_lambda_is_chosen_by_a_step_for_every_candidate_and_setting(plan, tmp_path):
-    steps = plan(tmp_path / "none", "--tag", "smoke", "--choose-penalty", "1,10", "--until", "rewards")
+    steps = plan(
+        tmp_path / "none", "--tag", "smoke", "--choose-penalty", "1,10", "--until", "rewards"
+    )
     trials = {name.removeprefix(f"{ROW}.irm.0.choice") for name in steps if ".choice" in name}
     left_out = {f".{weight}.without-{value}" for weight in (1, 10) for value in ("1x", "1.25x")}
     assert trials == {""} | left_out | {f"{trial}.returns" for trial in left_out}
@@ -107,7 +109,9 @@ def test_lambda_is_chosen_by_a_step_for_every_candidate_and_setting(plan, tmp_pa
 
 def test_every_candidate_has_a_name(plan, tmp_path):
     close = "0.1234567,0.1234568,1000000,1e20"
-    steps = plan(tmp_path / "none", "--tag", "smoke", "--choose-penalty", close, "--until", "rewards")
+    steps = plan(
+        tmp_path / "none", "--tag", "smoke", "--choose-penalty", close, "--until", "rewards"
+    )
     for weight in ("0.1234567", "0.1234568", "1000000", "1e20"):
         assert f"{ROW}.irm.0.choice.{weight}.without-1x" in steps
 

@@ -92,7 +92,10 @@ def test_a_call_may_set_a_field_of_the_labs(lab):
     table = {"table": "table1", "seeds": 0, "methods": "irm", "rows": "lunar-lander.engine-power"}
 
     def status(**configs):
-        found = {step["name"]: step["status"] for step in other.plan(**table, **configs, tag="smoke").steps}
+        found = {
+            step["name"]: step["status"]
+            for step in other.plan(**table, **configs, tag="smoke").steps
+        }
         return found["smoke.lunar-lander.engine-power.irm.0"]
 
     assert (status(), status(set={"airl.total_steps": steps})) == ("RUN", "HIT")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import errno
 import os
 import time
 from pathlib import Path
@@ -139,7 +138,7 @@ def test_another_users_artefacts_are_left(empty_store, family, monkeypatch):
     assert sorted(artefact.id for artefact in removed) == ours
     assert empty_store.ids() == [theirs] and not empty_store.verify([theirs])
     assert len(said) == 1 and theirs in said[0]
-    key = empty_store.artefacts()[0].manifest.record.key
+    key = next(iter(empty_store.artefacts())).manifest.record.key
     assert empty_store.find(key) is not None
 
 
