@@ -9,7 +9,7 @@ from torch import nn
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
-# Normalised observations are clipped to this, as in SB3's VecNormalize.
+# Normalised observations and rewards are clipped to this, as in SB3's VecNormalize.
 CLIP = 10.0
 
 

@@ -43,10 +43,12 @@ def check_group(found: object, observation_size: int, action_size: int) -> None:
         if not np.array_equal(maps[0], np.eye(size)):
             raise ValueError(f"the first map of {name} is not the identity")
     for first in range(count):
-        for second in range(count):
-            products = [maps[first] @ maps[second] for maps in found[:2]]
+        after = [[maps[first] @ maps[second] for maps in found[:2]] for second in range(count)]
+        for second, products in enumerate(after):
             if not any(_same(found, k, products) for k in range(count)):
                 raise ValueError(f"map {first} after map {second} is none of the maps: no group")
+        if not any(_same(found, 0, products) for products in after):
+            raise ValueError(f"no map undoes map {first}: no group")
 
 
 def _same(group: Symmetries, element: int, products: list[np.ndarray]) -> bool:

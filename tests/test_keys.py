@@ -739,7 +739,7 @@ def test_the_config_of_a_knob_changes_the_keys_of_its_settings_only():
         changed = replace(config, interventions={knob: listed})
         assert (key(demos(changed)) != key(demos(config))) == differs
         assert (changed.transfer_of(UNSEEN) != config.transfer_of(UNSEEN)) == differs
-        assert (changed.airl_of(UNSEEN) != config.airl_of(UNSEEN)) == differs
+        assert (changed.airl_of([UNSEEN]) != config.airl_of([UNSEEN])) == differs
         same = replace(changed, expert=config.expert, demonstrations=config.demonstrations)
         made_alike = clone.request(From(demos(config)), ENV, SETTINGS, same)
         assert (key(made_alike) != key(cloned(config))) == differs

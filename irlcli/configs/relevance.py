@@ -65,7 +65,7 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
             ``expert.ppo``.
     """
     if discrete_actions:
-        for name in ("use_sde", "log_std_init", "log_std_max"):
+        for name in ("use_sde", "sde_sample_freq", "log_std_init", "log_std_max"):
             if getattr(ppo, name) != getattr(_PPO, name):
                 raise UsageError(
                     f"{section}.{name} needs continuous actions", f"omit {section}.{name}"
@@ -92,6 +92,16 @@ def relevant_ppo(ppo: PPOConfig, discrete_actions: bool, section: str) -> PPOCon
     return replace(ppo, batch_size=min(ppo.batch_size, ppo.n_envs * ppo.n_steps))
 
 
+def check_actions(actions: str, discrete_actions: bool) -> None:
+    """Refuse an ``airl.actions`` that discrete actions, which have no bounds, do not have.
+
+    Raises:
+        UsageError: it needs continuous actions.
+    """
+    if discrete_actions and actions != _AIRL.actions:
+        raise UsageError(f"airl.actions = {actions} needs continuous actions", "omit airl.actions")
+
+
 def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     """``airl`` with every field reset that its method, replay, selection and actions do not use.
 
@@ -101,10 +111,7 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     _check_known("airl.learner", airl.learner, LEARNERS)
     check_penalty(airl.penalty, "airl")
     airl = replace(airl, **LEARNERS[airl.learner].fixes)
-    if discrete_actions and airl.actions != _AIRL.actions:
-        raise UsageError(
-            f"airl.actions = {airl.actions} needs continuous actions", "omit airl.actions"
-        )
+    check_actions(airl.actions, discrete_actions)
     airl = _penalty(airl)
     airl = _network(airl)
     airl = _kept_rounds(airl)

@@ -4,6 +4,7 @@ A field is part of every key it can influence; :mod:`irlcli.configs.relevance` s
 cannot.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
@@ -252,8 +253,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Empty is all.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
-            spaced as ``averaged_by`` says, up to the last. They begin with the first, so a penalised
-            method's mean includes rounds of the penalty's warm-up. 1 is the last g alone.
+            spaced as ``averaged_by`` says, up to the last. Each stands for the rounds since the one
+            before it; early ones may lie in the penalty's warm-up. 1 is the last g alone.
         averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
             the discriminator's ``learning-rate``, so that early rounds count more when it falls.
         plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is
@@ -368,9 +369,10 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The config of the expert of ``setting``, with the overrides of its only knob."""
         return self._of("expert", setting)
 
-    def airl_of(self, setting: Setting) -> AIRLConfig:
-        """The config of a reward learned in ``setting``, with the overrides of its only knob."""
-        return self._of("airl", setting)
+    def airl_of(self, settings: Sequence[Setting]) -> AIRLConfig:
+        """The config of a reward learned in ``settings``, with the overrides of their only knob."""
+        knobs = {setting.knobs for setting in settings}
+        return self._of("airl", settings[0]) if len(knobs) == 1 else self.airl
 
     def transfer_of(self, setting: Setting) -> TransferConfig:
         """The config of a policy retrained in ``setting``, with the overrides of its only knob."""

@@ -75,7 +75,8 @@ def train(
     Args:
         samples: [R, E, 2, B, D] float32, laid out as a discriminator's: label 0, then 1.
         hidden: width of the hidden layer; 0 for a linear classifier.
-        seeds: R, for the initial weights, and for what ``method`` draws.
+        seeds: R, for the initial weights, and for what ``method`` draws. The masks of dropout come from
+            one generator with the first seed, so with dropout a run depends on the others.
     """
     if method.shuffled:
         samples = torch.stack([_dealt(x, seed) for x, seed in zip(samples, seeds, strict=True)])

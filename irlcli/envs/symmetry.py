@@ -13,22 +13,19 @@ from irlcli.symmetries import Symmetries, check_group
 def symmetries(
     env: str, settings: Sequence[Setting], observation_size: int, action_size: int
 ) -> Symmetries:
-    """The symmetries of ``env`` that hold in each of ``settings``.
+    """The symmetries that ``env``, which declares some, has in each of ``settings``.
 
     Args:
         observation_size: D.
         action_size: A, the width of the actions that the discriminator sees.
 
     Raises:
-        UsageError: there are none.
+        UsageError: none holds in all of them.
         StageFailed: the function that returns them cannot be imported, fails, or returns no group of
             maps of these sizes.
     """
     place = environment(env).symmetries
-    if place is None:
-        raise UsageError(
-            f"airl.symmetries = true: {env} has no symmetries", "--set airl.symmetries=none"
-        )
+    assert place is not None
     with importing(f"environment {env!r}", place):
         function = resolve_name(place)
     arguments = [env_kwargs(env, setting) for setting in settings]

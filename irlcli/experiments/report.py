@@ -169,7 +169,7 @@ def _rows(plan: Plan) -> list[Row]:
         demos = plan.tasks[f"{plan.selection.tag}.{row}.demos"].request
         tree = msgspec.to_builtins(config) | {
             "expert": msgspec.to_builtins(config.expert_of(unseen[0])),
-            "airl": msgspec.to_builtins(config.airl_of(trained[0])),
+            "airl": msgspec.to_builtins(config.airl_of(trained)),
             "transfer": msgspec.to_builtins(config.transfer_of(unseen[0])),
         }
         rows.append(

@@ -275,7 +275,7 @@ def _run(
         yield Task(run.name, "rewards", cloned)
         yield from _imitation(_Reward(requests, demos, cloned, run, measures), {})
         return
-    airl = run.configs(env, fields(run.method, "airl")).airl_of(trained[0])
+    airl = run.configs(env, fields(run.method, "airl")).airl_of(trained)
     basis = {}
     if chosen.candidates and airl.penalty != "none":
         choice = choose_penalty.request(

@@ -157,13 +157,13 @@ class AIRL:
             weight_decay=config.weight_decay,
             fused=True,
         )
-        self._replay = Replay(
-            self._settings, config.replay_episodes_per_round, config.replay_capacity
-        )
-        self._challenger_replay = Replay(
-            self._settings,
-            config.challenger.replay_episodes_per_round,
-            config.challenger.replay_capacity,
+        self._replay, self._challenger_replay = (
+            Replay(
+                self._settings,
+                per_round=part.replay_episodes_per_round,
+                capacity=part.replay_capacity,
+            )
+            for part in (config, config.challenger)
         )
         # Standard deviation of the deployed g on the last round's samples of the student and on the
         # demonstrations.

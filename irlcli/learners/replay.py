@@ -58,7 +58,7 @@ class Replay:
         capacity: episodes kept of each setting.
     """
 
-    def __init__(self, settings: int, per_round: int, capacity: int):
+    def __init__(self, settings: int, *, per_round: int, capacity: int):
         self._per_round = per_round
         self._capacity = capacity
         self._episodes: list[list[Transitions]] = [[] for _ in range(settings)]

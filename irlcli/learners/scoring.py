@@ -45,7 +45,8 @@ def policy_reward(
             reward = reward - log_probs
         if absorbing and bool(terminated.any()):
             g, f = model.absorbing_reward(successors)
-            # absorbing_value() rounds otherwise, and would change every key's bytes.
+            # absorbing_value() multiplies in another order: rewards under existing keys would differ in the
+            # last bit.
             series = gamma / (1.0 - gamma)
             reward = reward + terminated * series * (g if form == "g" else f)
         return reward

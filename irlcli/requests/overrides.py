@@ -1,6 +1,7 @@
 """What ``--set`` asks for, beside what requests hold."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -30,7 +31,7 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
     if not overrides:
         return
     made = list(requests)
-    parameters = [request.parameters for request in made]
+    parameters = [_by_section(request) for request in made]
     for item, (field, value) in zip(overrides, overridden(overrides).items(), strict=True):
         if field.startswith(_OF_STUDENTS):
             retrained = [request for request in made if request.stage.name == "transfer"]
@@ -41,6 +42,13 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
         if held and _shown(field, value) not in held:
             values = " or ".join(sorted(text for text in held if text))
             yield f"--set {item} has no effect: the other values make it {values}"
+
+
+def _by_section(request: Request) -> Any:
+    """The parameters of ``request``, under the names that a config has for them."""
+    if request.stage.name == "train-expert":
+        return SimpleNamespace(expert=request.parameters)
+    return request.parameters
 
 
 def _held(field: str, parameters: Any) -> str | None:

@@ -63,7 +63,7 @@ def train_airl(
         "airl.state_only": state_only,
     }
     config = session.config(env, flags)
-    airl = config.airl_of(settings[0])
+    airl = config.airl_of(settings)
     arguments.check_weighted(airl_stage.name(airl), METHODS, airl.penalty, penalty_weight)
     basis: dict[str, Source] = {}
     if choose_penalty is not None:

@@ -140,6 +140,7 @@ class PPOTrainer:
         self.model._last_obs = self._venv.begin_round(self._purpose, self._seed, index)
         self.model._last_episode_starts = np.ones(self._venv.num_envs, dtype=bool)
         self._deviation.begin()
+        self.cap_noise()
         rollouts = []
         for _ in range(self.ppo.rollouts_per_round):
             rollout = self._collect()

@@ -54,13 +54,13 @@ def roll_out(
             env, plain, policy, episodes, seed, purpose, deterministic, noise, parallel
         )
         return [with_hints(trajectory, *cue) for trajectory in acted]
-    limit = environment(env).max_episode_steps
+    spec = environment(env)
+    limit, own = spec.max_episode_steps, spec.own is not None
     trajectories: list[Trajectory] = []
     for first in range(0, episodes, parallel):
         batch = range(first, min(first + parallel, episodes))
         seeds = [derive(purpose, seed, k)[0] for k in batch]
         torch.manual_seed(seeds[0])
-        own = environment(env).own is not None
         rng = np.random.default_rng(
             derive(f"{purpose} actions", seed, first)[0] if own else seeds[0]
         )

@@ -6,6 +6,7 @@ inside ``run`` only.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -196,6 +197,11 @@ def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
 
     def after_round(_: "Training | Restarts", newest: "list[Row]") -> None:
         _report(job, training, newest)
+        if len(training.rows) == len(newest) and all(isnan(row["true_return"]) for row in newest):
+            job.console.warn(
+                "no episode ended in the first round. A round begins with new episodes, so if all are "
+                "longer, nothing is learned about their later steps: raise n_steps or rollouts_per_round"
+            )
         job.checkpoints.offer(encoded)
 
     rows = training.run(after_round, job.console.warn)

@@ -6,7 +6,7 @@ import msgspec
 
 from irlcli.configs import Config
 from irlcli.configs.fields import Activation, Finite, Widths
-from irlcli.configs.relevance import relevant_ppo
+from irlcli.configs.relevance import check_actions, relevant_ppo
 from irlcli.configs.schema import CloneConfig
 from irlcli.envs.registry import environment
 from irlcli.interventions import Setting, check_tabular, parse_setting
@@ -57,8 +57,9 @@ def request(
         UsageError: a tabular environment, or an option that does not fit its actions.
     """
     check_tabular(env, "clone", wanted=False)
-    airl = config.airl_of(settings[0])
-    ppo = relevant_ppo(airl.ppo, environment(env).discrete_actions, "airl.ppo")
+    airl, discrete = config.airl_of(settings), environment(env).discrete_actions
+    check_actions(airl.actions, discrete)
+    ppo = relevant_ppo(airl.ppo, discrete, "airl.ppo")
     texts = tuple(str(s) for s in settings)
     parameters = Parameters(
         environment=environment_key(env, settings),

@@ -280,6 +280,11 @@ PARTS = ("airl.challenger.per_setting=true", "airl.averaged_by=learning-rate")
         ),
         ("transfer --reward airl --ood 1.5x", ["transfer.ceiling=none"], {}),
         (
+            "collect-experts --env reacher --intervention gravity=1x",
+            ["expert.ppo.sde_sample_freq=8", "expert.ppo.gamma=0.9"],
+            {"expert.ppo.sde_sample_freq=8": "none"},
+        ),
+        (
             "plan table1 --rows lunar-lander --tag x",
             ["airl.select_every=3"],
             {"airl.select_every=3": "10"},

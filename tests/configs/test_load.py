@@ -475,26 +475,25 @@ def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
         parse_settings("ant", text)[0] for text in ("leg-length=2x", "friction=2:0.6:0.6")
     )
     config = load_config("ant")
-    assert config.airl_of(legs).challenger.ppo == config.transfer_of(legs).ppo
-    assert config.airl_of(friction).challenger.ppo == config.transfer_of(friction).ppo
-    own = config.airl_of(legs).challenger
-    assert config.airl_of(legs) == msgspec.structs.replace(config.airl, challenger=own)
+    assert config.airl_of([legs]).challenger.ppo == config.transfer_of(legs).ppo
+    assert config.airl_of([friction]).challenger.ppo == config.transfer_of(friction).ppo
+    own = config.airl_of([legs]).challenger
+    assert config.airl_of([legs]) == msgspec.structs.replace(config.airl, challenger=own)
     # One challenger for the whole training, and a mean that has as many rounds as it asks for.
-    airl = relevant_airl(config.airl_of(friction), discrete_actions=False)
+    airl = relevant_airl(config.airl_of([friction]), discrete_actions=False)
     rounds = airl.ppo.rounds(airl.total_steps)
     assert airl.challenger.life == rounds and airl.averaged_rounds <= rounds
-    assert config.airl_of(legs).challenger.ppo.use_sde
+    assert config.airl_of([legs]).challenger.ppo.use_sde
     own = load_config("ant", file=toml("[airl.challenger.ppo]\nuse_sde = false"))
-    assert not own.airl_of(legs).challenger.ppo.use_sde and own.transfer_of(legs).ppo.use_sde
-    assert own.airl_of(legs).challenger.ppo.activation == "relu"
+    assert not own.airl_of([legs]).challenger.ppo.use_sde and own.transfer_of(legs).ppo.use_sde
+    assert own.airl_of([legs]).challenger.ppo.activation == "relu"
 
 
 def test_a_knob_has_rewards_of_its_own(toml):
     mine = toml("[interventions.bounce.airl]\nbatch_size = 64\n[airl]\nbc_epochs = 7")
     config = load_config(LANDER, file=mine, overrides=["airl.hidden=[8]"])
     bounce, power = (
-        config.airl_of(parse_settings(LANDER, text)[0])
-        for text in ("bounce=0.1", "engine-power=1x")
+        config.airl_of(parse_settings(LANDER, text)) for text in ("bounce=0.1", "engine-power=1x")
     )
     assert power == config.airl and (power.bc_epochs, power.hidden) == (7, (8,))
     assert bounce == msgspec.structs.replace(power, batch_size=64)
@@ -544,13 +543,13 @@ def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():
 
 def test_none_unsets_a_field_that_the_settings_set(toml):
     (friction,) = parse_settings("ant", "friction=1.5:0.1:0.1")
-    listed = load_config("ant").airl_of(friction)
+    listed = load_config("ant").airl_of([friction])
     assert listed.averaged_rounds == 30
     for source in (
         {"overrides": ["airl.averaged_rounds=none"]},
         {"file": toml('[airl]\naveraged_rounds = "none"')},
     ):
-        found = load_config("ant", **source).airl_of(friction)
+        found = load_config("ant", **source).airl_of([friction])
         assert found == msgspec.structs.replace(listed, averaged_rounds=msgspec.UNSET)
     with pytest.raises(UsageError, match="expected a whole number"):
         load_config("ant", overrides=["airl.averaged_rounds=some"])
@@ -585,3 +584,11 @@ def test_a_cap_on_the_noise_of_gsde_is_refused():
     capped = PPOConfig(use_sde=True, log_std_max=-1.0)
     with pytest.raises(UsageError, match=r"expert\.ppo\.log_std_max"):
         relevant_ppo(capped, False, "expert.ppo")
+
+
+def test_rewards_of_two_knobs_have_the_config_of_neither():
+    config = load_config("ant")
+    settings = [*parse_settings("ant", "mass=0.5x"), *parse_settings("ant", "friction=2:0.6:0.6")]
+    for order in (settings, settings[::-1]):
+        assert config.airl_of(order) == config.airl
+    assert config.airl_of(settings[1:]) != config.airl

@@ -119,6 +119,14 @@ QUARTER = np.array([[0.0, 1.0], [-1.0, 0.0]])
         (broken(actions=-np.ones((2, 1, 1), np.float32)), "first map of actions"),
         (broken(observations=np.array([np.eye(2), QUARTER], np.float32)), "no group"),
         (broken(actions=np.array([[[1.0]], [[2.0]]], np.float32)), "no group"),
+        # A mask instead of a reflection.
+        (
+            broken(
+                observations=np.array([np.eye(2), np.diag([1.0, 0.0])], np.float32),
+                actions=np.ones((2, 1, 1), np.float32),
+            ),
+            "undoes map 1",
+        ),
         # Twice a quarter turn is the identity up to the sign of a quaternion.
         (
             broken(observations=np.array([np.eye(2), QUARTER], np.float32), quaternion=slice(2)),

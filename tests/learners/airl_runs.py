@@ -31,6 +31,7 @@ def make(
     total_steps=10_000,
     horizon=None,
     kind=AIRL,
+    symmetries=None,
     **changes,
 ):
     """A trainer and a learner of ``demos`` in ``settings``, both with the time limit ``horizon``."""
@@ -50,6 +51,7 @@ def make(
         observation_size=worlds.observation_space.shape[0],
         actions=action_space(worlds.action_space),
         seed=seed,
+        symmetries=symmetries,
     )
     return trainer, learner
 

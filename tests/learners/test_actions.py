@@ -94,3 +94,9 @@ def test_executed_actions_of_another_size_are_named(demos):
 def test_discrete_actions_have_no_bounds():
     with pytest.raises(UsageError, match=r"airl\.actions = executed needs continuous actions"):
         relevant_airl(AIRLConfig(actions="executed"), discrete_actions=True)
+
+
+def test_a_cloned_policy_of_discrete_actions_has_no_bounds_either(irl, smoke_store):
+    line = ["train-airl", "--demos", "demos", "--method", "bc", "--set", "airl.actions=executed"]
+    done = irl(*line, "--profile", "smoke", "--store", smoke_store.path)
+    assert done.code == 2 and "airl.actions = executed needs continuous actions" in done.err

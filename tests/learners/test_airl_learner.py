@@ -1,5 +1,7 @@
 """The learner as a whole: groupings, diagnostics, cloning, resuming."""
 
+from dataclasses import replace as replaced
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from irlcli.learners.pools import Pool
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.loop import LastRound, Training
 from irlcli.rl.worlds import make_worlds
+from irlcli.symmetries import Symmetries
 from irlcli.trajectories import join
 
 # A round holds whole episodes at this time limit.
@@ -314,3 +317,68 @@ def test_observations_of_another_size_are_refused(demos):
 
     with pytest.raises(ValueError, match="observations of size 8"):
         make(demos, env="reacher", settings=parse_settings("reacher", "gravity=0.5x,2x"))
+
+
+def test_the_reward_is_the_network_that_the_config_describes(demos):
+    _, learner = make(demos, state_only=True, columns=(2,), hidden=(5, 6), activation="relu")
+    layers = list(learner.model.g)
+    widths = [layer.out_features for layer in layers if isinstance(layer, torch.nn.Linear)]
+    assert widths == [5, 6, 1] and any(isinstance(layer, torch.nn.ReLU) for layer in layers)
+    observations, actions = torch.zeros(2, 8), torch.eye(4)[:2]
+    here = learner.model.reward(observations, actions)
+    assert here[0] == here[1]
+    observations[:, 3] = 9.0
+    assert torch.equal(learner.model.reward(observations, actions), here)
+    observations[:, 2] = 9.0
+    assert not torch.equal(learner.model.reward(observations, actions), here)
+
+
+def challenged(demos, symmetries=None, **changes):
+    """A trainer, a learner and its challengers."""
+    parts = {"ppo": LONG, "logit": "f", "policy_reward": "f", **changes}
+    parts.setdefault("challenger", ChallengerConfig(life=9, ppo=LONG))
+    trainer, learner = make(demos, horizon=HORIZON, symmetries=symmetries, **parts)
+    worlds = make_worlds(LANDER, SETTINGS, LONG.n_envs)
+    worlds.max_episode_steps = HORIZON
+    return trainer, learner, Challengers([worlds], parts["challenger"], learner, 0, "test")
+
+
+def test_each_replay_has_its_own_sizes(demos):
+    challenger = ChallengerConfig(life=9, ppo=LONG, replay_episodes_per_round=3, replay_capacity=5)
+    changes = {"replay_episodes_per_round": 1, "replay_capacity": 2, "challenger": challenger}
+    trainer, learner, challengers = challenged(demos, **changes)
+    for index in range(3):
+        rollouts, theirs = trainer.train_round(index, learner), challengers.train_round(index)
+        learner.update(index, rollouts, trainer.policy, theirs)
+        for replay, most, kept in (
+            (learner._replay, 1, 2),
+            (learner._challenger_replay, 3, 5),
+        ):
+            assert [len(e) for e in replay._episodes] == [min(most * (index + 1), kept)] * 2
+
+
+def test_the_discriminator_sees_images_of_students_challengers_and_experts(demos, monkeypatch):
+    """All are at 5; the environment is the same with the other sign."""
+    signs = np.array([np.eye(8), -np.eye(8)], np.float32)
+    symmetries = Symmetries(signs, np.array([np.eye(4)] * 2, np.float32))
+    at_five = [
+        [replaced(t, observations=np.full_like(t.observations, 5.0)) for t in g] for g in demos
+    ]
+    trainer, learner, challengers = challenged(at_five, symmetries)
+    seen = []
+    original = airl.discriminator_logits
+
+    def spy(model, batch, *arguments, **options):
+        seen.append(batch.observations)
+        return original(model, batch, *arguments, **options)
+
+    monkeypatch.setattr(airl, "discriminator_logits", spy)
+    rollouts = [moved(r, 5.0) for r in trainer.train_round(0, learner)]
+    theirs = [moved(r, 5.0) for r in challengers.train_round(0)]
+    learner.update(0, rollouts, trainer.policy, theirs)
+    # The student's minibatches and the challengers', each with its policy's and the experts' samples.
+    assert len(seen) == 2 * CONFIG.updates_per_round
+    for batch in seen:
+        for label in (0, 1):
+            assert set(batch[:, label].unique().tolist()) == {-5.0, 5.0}
+    assert learner.model.normaliser.mean.abs().max() < 1.0

@@ -5,6 +5,7 @@ import torch
 from airl_runs import make, random_episodes
 from torch.nn.functional import softplus
 
+from irlcli.learners.airl import AIRL
 from irlcli.learners.gail import GAIL
 from irlcli.learners.reward_model import RewardModel
 from irlcli.learners.scoring import transformed_reward
@@ -57,8 +58,8 @@ def test_a_student_earns_what_is_never_negative_and_does_not_depend_on_its_likel
 def test_the_discriminator_learns_as_airls_does_from_logits_without_log_pi():
     demos = random_episodes(2)
     states = []
-    for kind in ({}, PLAIN):
-        trainer, learner = make(demos, **{**PLAIN, **kind})
+    for kind in (AIRL, GAIL):
+        trainer, learner = make(demos, **{**PLAIN, "kind": kind})
         rollouts = trainer.train_round(0, learner)
         learner.update(0, rollouts, trainer.policy)
         states.append(learner.model.state_dict())

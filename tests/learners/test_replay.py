@@ -121,7 +121,7 @@ def test_replay_keeps_whole_episodes_within_its_capacity():
 
 
 def test_a_resumed_replay_is_the_same():
-    replay, again = Replay(2, 2, 5), Replay(2, 2, 5)
+    replay, again = (Replay(2, per_round=2, capacity=5) for _ in range(2))
     data, numbers = joined([episode(3, 1.0), episode(5, 2.0), episode(4, 3.0)])
     replay.add(1, data, numbers, np.random.default_rng(0))
     again.load_state_dict(from_bytes(to_bytes(replay.state_dict())))
@@ -146,7 +146,7 @@ def test_the_replay_keeps_early_episodes_as_likely_as_late_ones():
     kept = np.zeros(40)
     runs = 400
     for seed in range(runs):
-        rng, replay = np.random.default_rng(seed), Replay(1, 2, 8)
+        rng, replay = np.random.default_rng(seed), Replay(1, per_round=2, capacity=8)
         for start in range(0, 40, 2):
             replay.add(0, *joined([episode(3, start), episode(3, start + 1)]), rng)
         (found,) = replay.transitions()

@@ -1,5 +1,7 @@
 """Rounds of PPO: recorded transitions, replaced rewards, seeds, resuming, saved policies."""
 
+from operator import attrgetter
+
 import numpy as np
 import pytest
 import torch
@@ -214,3 +216,23 @@ def test_not_a_number_in_the_rewards_is_a_named_failure():
     trainer = make_trainer()
     with pytest.raises(StageFailed, match="not finite after an update in round 0"):
         trainer.train_round(0, Reward(lambda rollout: np.full(rollout.terminated.shape, np.nan)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "attribute"),
+    [
+        ("n_epochs", 3, "n_epochs"),
+        ("gamma", 0.7, "gamma"),
+        ("gae_lambda", 0.6, "gae_lambda"),
+        ("ent_coef", 0.2, "ent_coef"),
+        ("vf_coef", 0.3, "vf_coef"),
+        ("max_grad_norm", 0.4, "max_grad_norm"),
+        ("batch_size", 64, "batch_size"),
+        ("n_steps", 64, "n_steps"),
+        ("ortho_init", False, "policy.ortho_init"),
+        ("net_arch", (8, 9), "policy.net_arch"),
+    ],
+)
+def test_the_library_has_the_configs_value(field, value, attribute):
+    found = attrgetter(attribute)(make_trainer(**{field: value}).model)
+    assert (tuple(found) if isinstance(value, tuple) else found) == value

@@ -297,3 +297,22 @@ def test_every_intervention_of_the_settings_can_be_learned_from(env, profile):
         demos = collect_experts.request(env, settings, config)
         train_airl.request(From(demos), env, settings, config.airl)
         parse_settings(env, f"{knob}={','.join(values.ood)}")
+
+
+def test_the_cap_on_the_deviation_holds_in_the_first_round():
+    trainer = make_trainer(log_std_init=1.0, log_std_max=-0.5, **NORMALISED)
+    acted = []
+
+    def reward(rollout):
+        # Called before the first update.
+        acted.append(trainer.model.policy.log_std.max().item())
+        return rollout.true_rewards
+
+    trainer.train_round(0, Reward(reward))
+    assert acted[0] == -0.5
+
+
+@pytest.mark.parametrize(("field", "value"), [("use_sde", True), ("sde_sample_freq", 7)])
+def test_the_library_has_the_configs_values_of_gsde(field, value):
+    trainer = make_trainer(use_sde=True, sde_sample_freq=7, **NORMALISED)
+    assert getattr(trainer.model, field) == value

@@ -151,3 +151,17 @@ def test_not_a_number_in_the_rewards_is_a_named_failure():
     trainer = make_trainer(learning_starts=0)
     with pytest.raises(StageFailed, match="not finite after an update in round 0"):
         trainer.train_round(0, Reward(lambda rollout: np.full(rollout.terminated.shape, np.nan)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("tau", 0.1),
+        ("learning_rate", 0.02),
+        ("gamma", 0.7),
+        ("batch_size", 16),
+        ("buffer_size", 800),
+    ],
+)
+def test_the_library_has_the_configs_value(field, value):
+    assert getattr(make_trainer(**{field: value}).model, field) == value
