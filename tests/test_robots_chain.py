@@ -2,11 +2,14 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.tensors import load_policy_file
 from irlcli.store import Store
 
 
@@ -86,6 +89,33 @@ def test_walkers_go_through_the_chain(tmp_path, irl, env, intervention, ood):
             assert "half-cheetah mass=2x" in done.err and "different observations" in done.err
             assert "hint: name a setting of goal-y, direction" in done.err
             assert "RUN" not in done.err
+
+
+def test_a_cloned_student_keeps_the_moments_of_the_demonstrations(chains, irl, tmp_path):
+    store = tmp_path / "runs"
+    shutil.copytree(chains / "1", store, symlinks=True)
+    line = ["train-airl", "--demos", "demos", "--method", "erm", "--set", "airl.bc_epochs=1"]
+    done = irl(*line, "--store", store, "--profile", "smoke", "--quiet")
+    assert done.code == 0, done.err
+    policy, _ = load_policy_file(Path(done.out.strip()) / "policy.pt")
+    counts = [v for name, v in policy.state_dict().items() if name.endswith("normaliser.count")]
+    demos = read_demonstrations(Store(store).resolve("demos").artefact.directory)
+    steps = sum(len(t) for episodes in demos.trajectories.values() for t in episodes)
+    assert counts and {float(count) for count in counts} == {float(steps)}
+
+
+@pytest.mark.parametrize(("value", "same"), [("true", False), ("false", True)])
+def test_an_evaluation_acts_as_it_is_asked_to(chains, irl, tmp_path, value, same):
+    """With ``deterministic`` by the policy's mean; otherwise, and by default, by samples."""
+    store = tmp_path / "runs"
+    shutil.copytree(chains / "1", store, symlinks=True)
+    line = ["evaluate", "--policy", "moved", "--store", store, "--profile", "smoke", "--quiet"]
+    found = []
+    for more in ([], ["--set", f"evaluation.deterministic={value}"]):
+        done = irl(*line, *more)
+        assert done.code == 0, done.err
+        found.append((Path(done.out.split()[0]) / "summary.json").read_text())
+    assert (found[0] == found[1]) == same
 
 
 def test_a_reward_learned_with_symmetries(tmp_path, irl):

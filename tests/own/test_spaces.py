@@ -242,6 +242,14 @@ def test_what_an_environment_prints_is_no_data(bench):
         assert "hello" in done.err
 
 
+@pytest.mark.parametrize("words", [RANDOM, COLLECT], ids=["evaluate", "collect-experts"])
+def test_an_episode_that_ends_on_an_error_is_named(bench, words):
+    bench.edit(bench.module, "> 5.0, False, {}", '> 5.0, False, {"error": "it fell over"}')
+    done = bench.irl(*words, *ONE)
+    assert done.code == 0, done.err
+    assert "warning: mass=2x, episode 0: it fell over" in done.err
+
+
 def test_the_example_passes_every_check(bench):
     done = bench.irl("envs", "check", "cart.toml")
     assert done.code == 0 and {line[:4] for line in done.out.splitlines()} == {"PASS"}
