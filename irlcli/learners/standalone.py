@@ -12,6 +12,9 @@ from irlcli.learners.scoring import absorbing_value
 class StandaloneReward(nn.Module):
     """min(g, ceiling) / scale, with the value of an absorbing state where one was learned.
 
+    It equals :meth:`irlcli.learners.frozen.FrozenReward.of_steps`, without that method's branch on the
+    data: an exported module has none.
+
     Args:
         model: the reward model.
         scale: standard deviation of g on training data.
