@@ -4,12 +4,17 @@ They come from parameters as they are stored. These may have been written by han
 assumed.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from irlcli.methods import method_name
-from irlcli.store import KeyRecord
+
+if TYPE_CHECKING:
+    # The command line's console imports this module at every start.
+    from irlcli.store import KeyRecord
 
 _MAX_LENGTH = 200
 # Section and field of a stage's parameters, and what they count.

@@ -25,9 +25,10 @@ def print_rows(evaluations: Sequence[Measured], stderr: bool = False) -> None:
         "learned return": [row.learned for row in found],
         "progress": [row.progress for row in found],
     }
-    for place, (column, values) in zip((4, 4), optional.items(), strict=True):
+    # Both after the deviation of the true return.
+    for column, values in optional.items():
         if any(value is not None for value in values):
-            columns.insert(place, column)
+            columns.insert(4, column)
             for cells, value in zip(table, values, strict=True):
-                cells.insert(place, "-" if value is None else f"{value:.1f}")
+                cells.insert(4, "-" if value is None else f"{value:.1f}")
     out.print_table(columns, table, stderr=stderr)

@@ -112,8 +112,8 @@ def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:
         others = other_versions({"libraries": versions})
         if others:
             session.console.warn(
-                f"{out.counted(names.count(name), 'artefact')} of this report: made with other "
-                f"library versions: {', '.join(others)}"
+                f"other library versions made {out.counted(names.count(name), 'artefact')} of this "
+                f"report: {', '.join(others)}"
             )
 
 

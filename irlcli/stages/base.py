@@ -197,7 +197,8 @@ def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
 
     def after_round(_: "Training | Restarts", newest: "list[Row]") -> None:
         _report(job, training, newest)
-        if len(training.rows) == len(newest) and all(isnan(row["true_return"]) for row in newest):
+        first = newest[0]["round"] == 0 and not newest[0].get("restart")
+        if first and all(isnan(row["true_return"]) for row in newest):
             job.console.warn(
                 "no episode ended in the first round. A round begins with new episodes, so if all are "
                 "longer, nothing is learned about their later steps: raise n_steps or rollouts_per_round"
