@@ -146,7 +146,7 @@ def _check(session: Session, spec: EnvironmentSpec, config: Config) -> None:
         error = StageFailed(
             f"{len(failed)} of {len(outcomes)} checks of {spec.name} failed: "
             f"{failed[0].what}: {failed[0].wrong}",
-            "docs/own-environments.md says what is expected",
+            "docs/own-environments.md and docs/extending.md say what is expected",
         )
         error.details = {"checks": _as_json(outcomes)}
         raise error

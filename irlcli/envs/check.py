@@ -51,7 +51,7 @@ def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Ite
     yield _outcome("gymnasium's check_env", partial(_check_env, spec))
     yield _outcome("equal seeds give equal episodes", partial(_check_seeds, spec))
     if spec.symmetries is not None:
-        yield _outcome("its symmetries are a group", partial(_check_symmetries, spec))
+        yield _outcome("its symmetries", partial(_check_symmetries, spec))
     for name, knob in spec.knobs.items():
         ends = [Setting(((name, value),)) for value in _ends(knob)]
         yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))

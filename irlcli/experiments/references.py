@@ -361,7 +361,7 @@ def _only(artefact: Artefact, name: str) -> str:
     if name not in names:
         makers = {
             "reward.pt": "`irl train-airl`",
-            "policy.pt": "`irl train-airl` or `irl transfer`",
+            "policy.pt": "`irl train-airl` or `irl transfer`, or an expert",
         }
         wanted = f"name an artefact of {makers[name]}; " if name in makers else ""
         raise NotFound(
