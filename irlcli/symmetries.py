@@ -4,6 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# Of products of float32.
+_ATOL = 1e-4
+
 
 class Symmetries(NamedTuple):
     """A group of K linear maps of observations [D] and actions [A]; the first is the identity.
@@ -42,23 +45,22 @@ def check_group(found: object, observation_size: int, action_size: int) -> None:
             )
         if not np.array_equal(maps[0], np.eye(size)):
             raise ValueError(f"the first map of {name} is not the identity")
+    # Linear maps are equal if, and almost surely only if, they agree on one random vector.
+    rng = np.random.default_rng(0)
+    seen = found.observations @ rng.normal(size=observation_size)
+    acted = found.actions @ rng.normal(size=action_size)
+    images = np.concatenate([seen, acted], axis=1)
+    if found.quaternion is not None:
+        # Both signs of a quaternion describe one orientation.
+        signed = images.copy()
+        signed[:, found.quaternion] *= -1.0
+        images = np.concatenate([images, signed])
     for first in range(count):
-        after = [[maps[first] @ maps[second] for maps in found[:2]] for second in range(count)]
-        for second, products in enumerate(after):
-            if not any(_same(found, k, products) for k in range(count)):
-                raise ValueError(f"map {first} after map {second} is none of the maps: no group")
-        if not any(_same(found, 0, products) for products in after):
+        after = [seen @ found.observations[first].T, acted @ found.actions[first].T]
+        same = np.abs(np.concatenate(after, axis=1)[:, None] - images).max(-1) < _ATOL
+        known = same.any(1)
+        if not known.all():
+            second = int(np.argmin(known))
+            raise ValueError(f"map {first} after map {second} is none of the maps: no group")
+        if not same[:, ::count].any():
             raise ValueError(f"no map undoes map {first}: no group")
-
-
-def _same(group: Symmetries, element: int, products: list[np.ndarray]) -> bool:
-    """Whether ``products`` are the maps of ``element``, up to the sign of the quaternion."""
-    observations, actions = products
-    signs = (1.0, -1.0) if group.quaternion is not None else (1.0,)
-    for sign in signs:
-        signed = observations.copy()
-        if group.quaternion is not None:
-            signed[group.quaternion] *= sign
-        if np.allclose(signed, group.observations[element], atol=1e-4):
-            return np.allclose(actions, group.actions[element], atol=1e-4)
-    return False

@@ -89,6 +89,7 @@ def _show(session: Session, spec: EnvironmentSpec, config: Config) -> None:
         "made by": spec.entry_point or spec.gym_id,
         "time limit": f"{spec.max_episode_steps} steps",
         "actions": "discrete" if spec.discrete_actions else "continuous",
+        "symmetries": spec.symmetries or "none declared",
     }
     if own is not None:
         version = own.code.version and f"{own.code.distribution} {own.code.version}"

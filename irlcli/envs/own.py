@@ -45,6 +45,7 @@ class _Env(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
     actions: Literal["discrete", "continuous"] | None = None
     arguments: dict[str, Any] = {}
     files: tuple[str, ...] = ()
+    symmetries: bool = False
 
 
 class _Knob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -108,6 +109,7 @@ def from_document(
     except UsageError as error:
         raise UsageError(f"{source}: {error.message}", error.hint) from None
     directory = None if file is None else file.parent
+    module = module_of(env.id, env.entry_point)
     spec = EnvironmentSpec(
         name=name,
         entry_point=env.entry_point or "",
@@ -115,11 +117,13 @@ def from_document(
         max_episode_steps=env.max_episode_steps or 1,
         knobs={knob: k.described(knob) for knob, k in knobs.items()},
         discrete_actions=env.actions == "discrete",
+        # In the environment's module, whose code is in the key.
+        symmetries=f"{module}:symmetries" if env.symmetries else None,
         physics=_PHYSICS,
         own=Own(
             id=env.id,
             arguments=env.arguments,
-            code=code or code_of(module_of(env.id, env.entry_point), env.files, directory, source),
+            code=code or code_of(module, env.files, directory, source),
             files=env.files,
             document={},
             source=source,

@@ -15,6 +15,17 @@ from irlcli.envs import registration, registry
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "own-environment"
 
 
+# The cart's mirror image moves as the cart does.
+SYMMETRIES = """
+
+def symmetries(settings):
+    from irlcli.symmetries import Symmetries
+
+    both = np.array([1.0, -1.0], np.float32)[:, None, None]
+    return Symmetries(both * np.eye(2, dtype=np.float32), both)
+"""
+
+
 class Bench(NamedTuple):
     """A directory with ``cart.toml`` and ``cart.py`` in it, where ``irl`` is run.
 
@@ -36,6 +47,10 @@ class Bench(NamedTuple):
         text = path.read_text()
         assert old in text
         path.write_text(text.replace(old, new))
+
+    def declare_symmetries(self) -> None:
+        self.module.write_text(self.module.read_text() + SYMMETRIES)
+        self.edit(self.toml, "[env]", "[env]\nsymmetries = true")
 
 
 @pytest.fixture

@@ -133,6 +133,7 @@ def test_only_what_can_change_a_result_changes_the_key(bench):
         (bench.toml, "[interventions.mass]", f"{knob}[interventions.mass]", "HIT"),
         (bench.toml, 'argument = "drag"', 'argument = "brake"', "HIT"),
         (bench.toml, 'actions = "continuous"', "", "HIT"),
+        (bench.toml, "[env]", "[env]\nsymmetries = true", "HIT"),
         (bench.toml, 'argument = "mass_scale"', 'argument = "drag"', "RUN"),
         (bench.toml, "max_episode_steps = 50", "max_episode_steps = 51", "RUN"),
         (bench.toml, '"cart:Cart-v0"', '"cart:Cart-v0"\nname = "wagon"', "RUN"),
@@ -151,6 +152,29 @@ def test_only_what_can_change_a_result_changes_the_key(bench):
     for name in ("cart.py", "cart.toml"):
         (bench.directory / name).unlink()
     assert status(bench, *IDLE, "--env", "copy/cart.toml") == "HIT"
+
+
+def test_a_reward_learned_with_the_symmetries_of_the_module(bench):
+    bench.declare_symmetries()
+    made(
+        bench,
+        "collect-experts",
+        "--env",
+        "cart.toml",
+        "--intervention",
+        "mass",
+        "--name",
+        "demos",
+        *SMOKE,
+    )
+    plain = ("train-airl", "--demos", "demos", "--set", "airl.logit=f", *SMOKE)
+    train = (*plain, "--set", "airl.symmetries=true")
+    with_images = made(bench, *train)
+    assert made(bench, *plain) != with_images
+    assert status(bench, *train) == "HIT"
+    bench.edit(bench.toml, "symmetries = true", "symmetries = false")
+    done = bench.irl(*train, "--env", "cart.toml", "--seed", "1")
+    assert done.code == 2 and "cart has no symmetries" in done.err
 
 
 def test_a_process_does_not_mix_two_versions_of_a_module(bench):

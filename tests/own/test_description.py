@@ -56,6 +56,7 @@ DOCUMENT = st.fixed_dictionaries(
                 # Upper case, so that none is the argument of a knob.
                 "arguments": st.dictionaries(st.sampled_from("ABC"), NUMBERS | st.booleans()),
                 "files": st.lists(st.sampled_from(["a.xml", "b/*.json"])),
+                "symmetries": st.booleans(),
             },
         ),
         "knobs": st.dictionaries(WORDS.filter(lambda name: name != "default"), KNOB, max_size=4),
@@ -113,6 +114,7 @@ WRONG = [
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nname = "a b"', 2, "'a b'", "letters"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["x.xml"]', 3, "'x.xml'", "relative"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["../x"]', 2, "'../x'", "below"),
+    ("[env]", "[env]\nsymmetries = 1", 2, "env.symmetries", "own-environments"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfoo = 1', 2, "'env.foo'", "known: "),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\narguments.a = nan', 2, "env.arguments.a", "num"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\narguments.drag = 1', 2, "knobs.drag", "omit"),

@@ -295,6 +295,22 @@ def test_checks_find_what_is_wrong(bench, old, new, failed, named):
     assert named in lines[lines.index(f"FAIL  {failed}") + 1]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "verdict", "named"),
+    [
+        ("def symmetries", "def symmetries", "PASS", ""),
+        ("[1.0, -1.0]", "[1.0, -2.0]", "FAIL", "no group"),
+        ("def symmetries", "def mirrored", "FAIL", "symmetries"),
+    ],
+)
+def test_declared_symmetries_are_checked(bench, old, new, verdict, named):
+    bench.declare_symmetries()
+    bench.edit(bench.module, old, new)
+    assert "cart:symmetries" in bench.irl("envs", "show", "cart.toml").out
+    lines = bench.irl("envs", "check", "cart.toml").out.splitlines()
+    assert named in lines[lines.index(f"{verdict}  its symmetries") + 1]
+
+
 def test_a_knob_that_extends_the_observation_must_say_so(bench):
     bench.edit(
         bench.module,

@@ -25,19 +25,22 @@ def _knobs(legs: str) -> dict[str, Knob]:
     }
 
 
-def _spec(name: str, robot: str, knobs: dict[str, Knob]) -> EnvironmentSpec:
+def _spec(
+    name: str, robot: str, knobs: dict[str, Knob], symmetries: str | None = None
+) -> EnvironmentSpec:
     return EnvironmentSpec(
         name=name,
         entry_point=f"irlcli.envs.mujoco.env:{robot}",
         gym_id=f"irlcli/MuJoCo{robot}-v0",
         max_episode_steps=1000,
         knobs=knobs,
+        symmetries=symmetries,
         unobserved="the horizontal position of the robot",
         needs=MUJOCO,
     )
 
 
-def _falling(name: str, robot: str, legs: str) -> EnvironmentSpec:
+def _falling(name: str, robot: str, legs: str, symmetries: str | None = None) -> EnvironmentSpec:
     """A robot whose episode may end with a fall."""
     ends = Knob(
         "terminate_when_unhealthy",
@@ -47,11 +50,11 @@ def _falling(name: str, robot: str, legs: str) -> EnvironmentSpec:
         "whether a fall ends the episode",
         whole=True,
     )
-    return _spec(name, robot, {**_knobs(legs), "terminate-when-unhealthy": ends})
+    return _spec(name, robot, {**_knobs(legs), "terminate-when-unhealthy": ends}, symmetries)
 
 
 MUJOCO_ROBOTS = (
-    _falling("mujoco-ant", "Ant", "the hind legs"),
+    _falling("mujoco-ant", "Ant", "the hind legs", "irlcli.envs.mujoco.symmetries:ant"),
     _spec("mujoco-half-cheetah", "HalfCheetah", _knobs("both legs")),
     _falling("mujoco-hopper", "Hopper", "the leg"),
     _falling("mujoco-walker2d", "Walker2d", "both legs"),
