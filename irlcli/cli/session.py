@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 # The parts of a config that a stage and its command read. Challengers learn with the PPO of retrained
-# policies, clones have the student's network, and a collected expert is compared with the bar. What
+# policies, clones also have the student's network, and a collected expert is compared with the bar. What
 # other stages read is not checked: a bank, say, is looked for under the whole config.
 _SECTIONS = {
     "train-expert": {"expert"},
     "collect-experts": {"demonstrations", "expert", "gridworld"},
     "train-airl": {"airl", "transfer.ppo"},
     "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
-    "clone": {"airl.ppo", "airl.actions", "clone"},
+    "clone": {"airl.actions", "clone"},
     "train-maxent": {"maxent"},
     "transfer": {"transfer"},
     "evaluate": {"evaluation"},
@@ -182,6 +182,10 @@ class StageSession(base.StageSession):
         if not stages <= _SECTIONS.keys():
             return
         read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
+        if "clone" in stages:
+            from irlcli.stages.clone import Network
+
+            read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
         for item in self.overrides:
             field = item.partition("=")[0].strip()
             if not any(f"{field}.".startswith(f"{part}.") for part in read):

@@ -46,8 +46,12 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
 
 def _by_section(request: Request) -> Any:
     """The parameters of ``request``, under the names that a config has for them."""
-    if request.stage.name == "train-expert":
-        return SimpleNamespace(expert=request.parameters)
+    match request.stage.name:
+        case "train-expert":
+            return SimpleNamespace(expert=request.parameters)
+        case "sweep-maxent":
+            # What the sweep varies is at its default here.
+            return SimpleNamespace(maxent=request.parameters.shared)
     return request.parameters
 
 

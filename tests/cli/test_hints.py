@@ -230,6 +230,7 @@ POWER = "--env lunar-lander --intervention engine-power=1x"
         ("train-airl --demos demos --method irm", "transfer.ceiling=0.5", True),
         ("train-airl --demos demos --method bc", "airl.gradient_penalty=3", True),
         ("train-airl --demos demos --method bc", "airl.ppo.net_arch=[8]", False),
+        ("train-airl --demos demos --method bc", "airl.ppo.learning_rate=1", True),
         ("train-airl --demos demos --method irm", "expert.total_steps=9999", True),
         ("assess airl", "expert.total_steps=9999", False),
     ],
@@ -279,6 +280,11 @@ PARTS = ("airl.challenger.per_setting=true", "airl.averaged_by=learning-rate")
             {"transfer.total_steps=5": "7"},
         ),
         ("transfer --reward airl --ood 1.5x", ["transfer.ceiling=none"], {}),
+        (
+            "plan figure2 --tag x",
+            ["maxent.penalty_weight=3", "maxent.iterations=9"],
+            {"maxent.penalty_weight=3": "0.0"},
+        ),
         (
             "collect-experts --env reacher --intervention gravity=1x",
             ["expert.ppo.sde_sample_freq=8", "expert.ppo.gamma=0.9"],
