@@ -6,7 +6,7 @@ Algorithm 1, as this module reads from top to bottom. In every round
    challenger, if there is one, on the reward alone (:meth:`AIRL.challenger_rewards`);
 2. the round's episodes become samples labelled *policy*, the demonstrations samples labelled
    *expert*, grouped into risks (:meth:`AIRL.update`);
-3. the discriminator minimises :func:`discriminator_loss`, the mean of the risks' cross-entropies
+3. the discriminator minimises :func:`~irlcli.learners.discriminator.discriminator_loss`, the mean of the risks' cross-entropies
    plus lambda times the penalty.
 
 Tensors in, tensors out: files, logging and the RL library stay outside. Samples are laid out
@@ -38,27 +38,20 @@ from irlcli.errors import StageFailed
 from irlcli.learners.actions import ActionView, Policy, check_fit
 from irlcli.learners.averaging import averaged_after
 from irlcli.learners.cloning import clone
-from irlcli.learners.discriminator import (
-    Loss,
-    discriminator_logits,
-    discriminator_loss,
-    gradient_penalty,
-    measured,
-    penalty_weight_at,
-)
-from irlcli.learners.grouping import Group, Part, apportion, group
+from irlcli.learners.discriminator import measured, minibatch_loss, penalty_weight_at
+from irlcli.learners.grouping import Part, group
 from irlcli.learners.images import Images
 from irlcli.learners.mixing import mixed
 from irlcli.learners.pools import (
     Minibatch,
     Pool,
     Stratum,
-    join_pools,
     make_pool,
     sample_minibatch,
 )
 from irlcli.learners.replay import Replay, whole_episodes
 from irlcli.learners.reward_model import AveragedReward, RewardModel, RewardModule
+from irlcli.learners.risks import risk_strata
 from irlcli.learners.scoring import (
     level_of,
     policy_reward,
@@ -67,7 +60,6 @@ from irlcli.learners.scoring import (
     transformed_reward,
 )
 from irlcli.networks import all_finite
-from irlcli.penalties import PenaltyOptions
 from irlcli.seeds import derive
 from irlcli.symmetries import Symmetries
 from irlcli.trajectories import (
@@ -307,7 +299,9 @@ class AIRL:
                     challenger = self._sampled(challenger_risks, generator)
                     if config.challenger.mixed_share:
                         challenger = mixed(challenger, config.challenger.mixed_share, generator)
-                loss = self._loss(batch, challenger, weight, generator)
+                loss = minibatch_loss(
+                    self.model, batch, challenger, self._weights, config, weight, generator
+                )
                 self._optimizer.zero_grad()
                 loss.total.backward()
                 torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
@@ -320,41 +314,6 @@ class AIRL:
                 "a smaller airl.learning_rate or airl.penalty_weight usually helps",
             )
         return losses
-
-    def _loss(
-        self,
-        batch: Minibatch,
-        challenger: Minibatch | None,
-        weight: float,
-        generator: torch.Generator,
-    ) -> Loss:
-        """The loss on a minibatch of the student's samples, and one of a challenger's."""
-        config = self.config
-        logits, f = discriminator_logits(self.model, batch, config.logit)
-        challenger_logits = None
-        if challenger is not None:
-            challenger_logits, _ = discriminator_logits(self.model, challenger, config.logit)
-
-        def input_gradient() -> torch.Tensor:
-            found = []
-            for part in (batch,) if challenger is None else (batch, challenger):
-                mix = torch.rand(*part.log_probs[:, 0].shape, 1, generator=generator)
-                found.append(gradient_penalty(self.model, part, mix))
-            return torch.stack(found).mean()
-
-        return discriminator_loss(
-            logits,
-            f,
-            self._weights,
-            merge_risks=config.grouping == "balanced",
-            penalty=config.penalty,
-            options=self._penalty_options(weight),
-            challenger_logits=challenger_logits,
-            challenger_share=config.challenger.share,
-            input_gradient=input_gradient,
-            input_gradient_weight=config.gradient_penalty,
-            parameters=tuple(self.model.parameters()),
-        )
 
     def _rate(self, index: int) -> float:
         """The discriminator's learning rate in round ``index``."""
@@ -385,16 +344,7 @@ class AIRL:
         expert: Sequence[Pool],
         policy: Policy | None,
     ) -> list[list[Stratum]]:
-        """What each risk's minibatch is drawn from. Every method draws as many samples."""
-        # Every round adds to every setting, so all of them have a past or none has.
-        past = [self._pool(data, policy) for data in replay.transitions()]
-        size = self.config.batch_size * self._settings // len(self._groups)
-
-        def paired(pools: Sequence[Pool], part: Part) -> list[Pool]:
-            """The policy's pools that go with ``part``: of the same setting, or of all."""
-            if self.config.pairing == "pooled":
-                return list(pools)
-            return [pools[part.setting]]
+        """What each risk's minibatch is drawn from, see :func:`risk_strata`."""
 
         def demonstrated(part: Part) -> Pool:
             own = self._demonstrations[part.setting]
@@ -402,24 +352,10 @@ class AIRL:
                 return expert[part.setting]
             return self._pool(join([own[i] for i in part.episodes]), policy)
 
-        def strata(members: Group) -> list[Stratum]:
-            counts = apportion(size, [part.share for part in members.parts])
-            return [
-                Stratum(
-                    policy=join_pools(paired(current, part)),
-                    expert=demonstrated(part),
-                    past=join_pools(paired(past, part)) if past else None,
-                    count=count,
-                )
-                for part, count in zip(members.parts, counts, strict=True)
-            ]
-
-        return [strata(members) for members in self._groups]
-
-    def _penalty_options(self, weight: float) -> PenaltyOptions:
-        return PenaltyOptions(
-            self.config.penalty_scaling, self.config.penalty_estimate == "unbiased", weight
-        )
+        # Every round adds to every setting, so all of them have a past or none has.
+        past = [self._pool(data, policy) for data in replay.transitions()]
+        samples = self.config.batch_size * self._settings
+        return risk_strata(self._groups, samples, current, past, demonstrated, self.config.pairing)
 
     @property
     def deployed(self) -> RewardModule:

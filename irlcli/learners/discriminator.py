@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 
+from irlcli.configs.schema import AIRLConfig
 from irlcli.learners.pools import Minibatch, Pool, Stratum, sample_minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
@@ -114,6 +115,52 @@ def discriminator_loss(
         total = total + options.weight * penalised
         total = total / loss_divisor(penalty, options.weight)
     return Loss(total, risk.detach(), penalised.detach())
+
+
+def minibatch_loss(
+    model: RewardModel,
+    batch: Minibatch,
+    challenger: Minibatch | None,
+    weights: torch.Tensor,
+    config: AIRLConfig,
+    penalty_weight: float,
+    generator: torch.Generator,
+) -> Loss:
+    """:func:`discriminator_loss` of ``model``, as ``config`` says.
+
+    Args:
+        batch: the student's and the experts' samples [E, 2, B].
+        challenger: a challenger's and the experts'; None: there is none.
+        weights: w [E], in sum one.
+        penalty_weight: lambda of this round.
+        generator: draws the points of the gradient penalty.
+    """
+    logits, f = discriminator_logits(model, batch, config.logit)
+    challenger_logits = None
+    if challenger is not None:
+        challenger_logits, _ = discriminator_logits(model, challenger, config.logit)
+
+    def input_gradient() -> torch.Tensor:
+        found = []
+        for part in (batch,) if challenger is None else (batch, challenger):
+            mix = torch.rand(*part.log_probs[:, 0].shape, 1, generator=generator)
+            found.append(gradient_penalty(model, part, mix))
+        return torch.stack(found).mean()
+
+    unbiased = config.penalty_estimate == "unbiased"
+    return discriminator_loss(
+        logits,
+        f,
+        weights,
+        merge_risks=config.grouping == "balanced",
+        penalty=config.penalty,
+        options=PenaltyOptions(config.penalty_scaling, unbiased, penalty_weight),
+        challenger_logits=challenger_logits,
+        challenger_share=config.challenger.share,
+        input_gradient=input_gradient,
+        input_gradient_weight=config.gradient_penalty,
+        parameters=tuple(model.parameters()),
+    )
 
 
 def _merged(samples: torch.Tensor) -> torch.Tensor:

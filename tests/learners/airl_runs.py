@@ -7,6 +7,7 @@ from msgspec.structs import replace
 from irlcli.configs import AIRLConfig, PPOConfig
 from irlcli.envs.registry import environment
 from irlcli.interventions import parse_settings
+from irlcli.learners import airl
 from irlcli.learners.airl import AIRL
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
@@ -63,3 +64,23 @@ def moved(rollout, value, worlds=slice(None)):
     for array in states.values():
         array[:, worlds] = value
     return dataclasses.replace(rollout, **states)
+
+
+def worlds_of(settings, count, horizon):
+    """``count`` worlds of ``settings`` with the time limit ``horizon``."""
+    worlds = make_worlds(LANDER, settings, count)
+    worlds.max_episode_steps = horizon
+    return worlds
+
+
+def record_losses(monkeypatch):
+    """A list to which every update adds its student's minibatch, its challenger's, and the loss."""
+    seen, original = [], airl.minibatch_loss
+
+    def record(model, batch, challenger, *arguments):
+        loss = original(model, batch, challenger, *arguments)
+        seen.append((batch, challenger, loss))
+        return loss
+
+    monkeypatch.setattr(airl, "minibatch_loss", record)
+    return seen

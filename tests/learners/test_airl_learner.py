@@ -5,7 +5,15 @@ from dataclasses import replace as replaced
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, LANDER, SETTINGS, make, moved, random_episodes
+from airl_runs import (
+    CONFIG,
+    SETTINGS,
+    make,
+    moved,
+    random_episodes,
+    record_losses,
+    worlds_of,
+)
 from msgspec.structs import replace
 
 from irlcli.configs import ChallengerConfig, PPOConfig
@@ -13,11 +21,11 @@ from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.learners import airl
 from irlcli.learners.discriminator import measured
 from irlcli.learners.pools import Pool
+from irlcli.learners.replay import whole_episodes
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.loop import LastRound, Training
-from irlcli.rl.worlds import make_worlds
 from irlcli.symmetries import Symmetries
-from irlcli.trajectories import join
+from irlcli.trajectories import join, transitions
 
 # A round holds whole episodes at this time limit.
 HORIZON = 200
@@ -30,6 +38,11 @@ def demos():
     return random_episodes(4)
 
 
+def shown(demos):
+    """All transitions of ``demos``."""
+    return transitions([episode for episodes in demos for episode in episodes], HORIZON)
+
+
 def updated(demos, rounds=1, **changes):
     trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, **changes)
     for index in range(rounds):
@@ -40,18 +53,10 @@ def updated(demos, rounds=1, **changes):
 
 def test_the_logged_objective_is_the_one_that_was_optimised(demos, monkeypatch):
     """With replay: mean over the round's minibatches of what the optimiser minimised."""
-    seen = []
-    original = airl.discriminator_loss
-
-    def spy(*arguments, **options):
-        loss = original(*arguments, **options)
-        seen.append(loss)
-        return loss
-
-    monkeypatch.setattr(airl, "discriminator_loss", spy)
+    seen = record_losses(monkeypatch)
     changes = {**IRM, "penalty_warmup_rounds": 0, "penalty_ramp_rounds": 1, "updates_per_round": 3}
     _, _, rows = updated(demos, rounds=2, **changes)
-    last = seen[-3:]
+    last = [loss for _, _, loss in seen[-3:]]
     for row in rows:
         assert row["penalty_weight"] == 10.0
         for name, values in (
@@ -116,8 +121,8 @@ def observed(demos):
     trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, fixed_horizon=False)
     rollouts = [moved(r, 5.0) for r in trainer.train_round(0, learner)]
     learner.update(0, rollouts, trainer.policy)
-    generated = [data for data, _ in learner._generated(rollouts)]
-    return learner, join([*generated, *[d for own in learner._demonstrations for d in own]])
+    generated, _ = whole_episodes(rollouts, np.ones(8, bool), HORIZON)
+    return learner, join([generated, shown(demos)])
 
 
 def test_observations_are_normalised_by_demonstrations_and_rollouts(demos):
@@ -135,19 +140,12 @@ def test_the_scale_is_the_deviation_of_g_over_demonstrations_and_rollouts(demos)
 
 
 def test_every_round_draws_other_samples(demos, monkeypatch):
-    drawn = []
-    original = airl.discriminator_logits
-
-    def spy(model, batch, form):
-        drawn.append(batch.observations)
-        return original(model, batch, form)
-
-    monkeypatch.setattr(airl, "discriminator_logits", spy)
+    drawn = record_losses(monkeypatch)
     trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, updates_per_round=1, replay_share=0.0)
     rollouts = trainer.train_round(0, learner)
     for index in range(2):
         learner.update(index, rollouts, trainer.policy)
-    first, second = drawn
+    first, second = (batch.observations for batch, _, _ in drawn)
     assert first.shape == second.shape and not torch.equal(first, second)
 
 
@@ -180,51 +178,24 @@ def test_shuffled_labels_learn_another_reward(demos):
     assert to_bytes(plain.snapshot()) != to_bytes(shuffled.snapshot())
 
 
-def test_the_learners_seed_deals_the_episodes_out(demos):
-    one, other = (make(demos, grouping="shuffled", seed=seed)[1]._groups for seed in (0, 1))
-    assert str(one) != str(other)
+def test_the_learners_seed_deals_the_episodes_out(demos, monkeypatch):
+    dealt, original = [], airl.risk_strata
+
+    def record(groups, *arguments):
+        dealt.append(str([[part.episodes for part in group.parts] for group in groups]))
+        return original(groups, *arguments)
+
+    monkeypatch.setattr(airl, "risk_strata", record)
+    for seed in (0, 1, 1):
+        updated(demos, grouping="shuffled", seed=seed)
+    assert dealt[0] != dealt[1] == dealt[2]
 
 
 def test_every_grouping_draws_as_many_samples(demos, monkeypatch):
-    sizes = {}
-    original = airl.discriminator_logits
+    drawn = record_losses(monkeypatch)
     for grouping in ("pooled", "balanced", "per-setting", "shuffled"):
-
-        def spy(model, batch, form, grouping=grouping):
-            sizes.setdefault(grouping, batch.log_probs.numel())
-            return original(model, batch, form)
-
-        monkeypatch.setattr(airl, "discriminator_logits", spy)
         updated(demos, grouping=grouping)
-    assert len(set(sizes.values())) == 1
-
-
-def test_the_policys_samples_are_shared_out_as_the_demonstrations_are(demos):
-    """Otherwise the discriminator could learn how often a setting was demonstrated."""
-    few = [demos[0][:1], demos[1][:3]]
-    trainer, learner = make(few, ppo=LONG, horizon=HORIZON, batch_size=64)
-    pools = [
-        learner._pool(data, None) for data, _ in learner._generated(trainer.train_round(0, learner))
-    ]
-    ((first, second),) = learner._risks(pools, learner._replay, pools, None)
-    assert (first.count, second.count) == (32, 96)
-    for setting, stratum in enumerate((first, second)):
-        assert torch.equal(stratum.policy.observations, pools[setting].observations)
-
-
-@pytest.mark.parametrize(("pairing", "met"), [("matched", [{0}, {1}]), ("pooled", 2 * [{0, 1}])])
-def test_a_risk_meets_the_policys_samples_of_its_own_setting_or_of_all(demos, pairing, met):
-    """The policy of setting 0 is always at 0, that of setting 1 at 1, also in the replay."""
-    trainer, learner = make(
-        demos, ppo=LONG, horizon=HORIZON, grouping="per-setting", pairing=pairing
-    )
-    rollouts = trainer.train_round(0, learner)
-    rollouts = [moved(moved(r, 0.0, slice(0, 4)), 1.0, slice(4, 8)) for r in rollouts]
-    learner.update(0, rollouts, trainer.policy)
-    pools = [learner._pool(data, None) for data, _ in learner._generated(rollouts)]
-    risks = learner._risks(pools, learner._replay, pools, None)
-    for which in (lambda stratum: stratum.policy, lambda stratum: stratum.past):
-        assert [set(which(s).observations.unique().tolist()) for (s,) in risks] == met
+    assert len({batch.log_probs.numel() for batch, _, _ in drawn}) == 1
 
 
 def test_a_student_begins_as_a_clone_of_all_experts(demos):
@@ -233,7 +204,7 @@ def test_a_student_begins_as_a_clone_of_all_experts(demos):
     for grouping, epochs in (("pooled", 0), ("pooled", 5), ("shuffled", 5)):
         trainer, learner = make(demos, grouping=grouping, bc_epochs=epochs)
         learner.begin(trainer)
-        data = join([episode for group in learner._demonstrations for episode in group])
+        data = learner.view.of(shown(demos))
         likelihood = float(learner.view.log_prob(trainer.policy, data).mean())
         found[grouping, epochs] = likelihood, to_bytes(trainer.state_dict())
     untouched, _ = make(demos)
@@ -248,8 +219,7 @@ def test_a_clone_keeps_the_moments_of_its_demonstrations(demos):
     learner.begin(trainer)
     normaliser = trainer.model.policy.features_extractor.normaliser
     before = normaliser.mean.clone()
-    data = join([episode for group in learner._demonstrations for episode in group])
-    np.testing.assert_allclose(before, data.observations.astype(float).mean(0), rtol=1e-6)
+    np.testing.assert_allclose(before, shown(demos).observations.astype(float).mean(0), rtol=1e-6)
     trainer.train_round(0, learner)
     assert torch.equal(normaliser.mean, before)
     plain, other = make(demos, ppo=ppo)
@@ -294,9 +264,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(demos, changes):
         )
         challengers = None
         if learner.config.challenger.life > 0:
-            worlds = [trainer._venv.worlds]
+            worlds = [worlds_of(SETTINGS, LONG.n_envs, HORIZON)]
             if learner.config.challenger.per_setting:
-                worlds = [make_worlds(LANDER, [setting], 4) for setting in SETTINGS]
+                worlds = [worlds_of([setting], 4, HORIZON) for setting in SETTINGS]
             challengers = Challengers(worlds, learner.config.challenger, learner, 0, "test")
         return Training(trainer, learner, learner, LastRound(), ["one", "other"], challengers)
 
@@ -338,8 +308,7 @@ def challenged(demos, symmetries=None, **changes):
     parts = {"ppo": LONG, "logit": "f", "policy_reward": "f", **changes}
     parts.setdefault("challenger", ChallengerConfig(life=9, ppo=LONG))
     trainer, learner = make(demos, horizon=HORIZON, symmetries=symmetries, **parts)
-    worlds = make_worlds(LANDER, SETTINGS, LONG.n_envs)
-    worlds.max_episode_steps = HORIZON
+    worlds = worlds_of(SETTINGS, LONG.n_envs, HORIZON)
     return trainer, learner, Challengers([worlds], parts["challenger"], learner, 0, "test")
 
 
@@ -350,11 +319,9 @@ def test_each_replay_has_its_own_sizes(demos):
     for index in range(3):
         rollouts, theirs = trainer.train_round(index, learner), challengers.train_round(index)
         learner.update(index, rollouts, trainer.policy, theirs)
-        for replay, most, kept in (
-            (learner._replay, 1, 2),
-            (learner._challenger_replay, 3, 5),
-        ):
-            assert [len(e) for e in replay._episodes] == [min(most * (index + 1), kept)] * 2
+        for replay, most, kept in (("replay", 1, 2), ("challenger_replay", 3, 5)):
+            held = [len(own["lengths"]) for own in learner.state_dict()[replay]["settings"]]
+            assert held == [min(most * (index + 1), kept)] * 2
 
 
 def test_the_discriminator_sees_images_of_students_challengers_and_experts(demos, monkeypatch):
@@ -365,20 +332,14 @@ def test_the_discriminator_sees_images_of_students_challengers_and_experts(demos
         [replaced(t, observations=np.full_like(t.observations, 5.0)) for t in g] for g in demos
     ]
     trainer, learner, challengers = challenged(at_five, symmetries)
-    seen = []
-    original = airl.discriminator_logits
-
-    def spy(model, batch, *arguments, **options):
-        seen.append(batch.observations)
-        return original(model, batch, *arguments, **options)
-
-    monkeypatch.setattr(airl, "discriminator_logits", spy)
+    seen = record_losses(monkeypatch)
     rollouts = [moved(r, 5.0) for r in trainer.train_round(0, learner)]
     theirs = [moved(r, 5.0) for r in challengers.train_round(0)]
     learner.update(0, rollouts, trainer.policy, theirs)
     # The student's minibatches and the challengers', each with its policy's and the experts' samples.
-    assert len(seen) == 2 * CONFIG.updates_per_round
-    for batch in seen:
-        for label in (0, 1):
-            assert set(batch[:, label].unique().tolist()) == {-5.0, 5.0}
+    assert len(seen) == CONFIG.updates_per_round
+    for student, challenger, _ in seen:
+        for batch in (student, challenger):
+            for label in (0, 1):
+                assert set(batch.observations[:, label].unique().tolist()) == {-5.0, 5.0}
     assert learner.model.normaliser.mean.abs().max() < 1.0

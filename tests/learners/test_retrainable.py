@@ -5,7 +5,16 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from airl_runs import CONFIG, LANDER, SETTINGS, make, moved, random_episodes
+from airl_runs import (
+    CONFIG,
+    LANDER,
+    SETTINGS,
+    make,
+    moved,
+    random_episodes,
+    record_losses,
+    worlds_of,
+)
 from msgspec.structs import replace
 
 from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
@@ -120,9 +129,13 @@ def test_the_gradients_of_student_and_challenger_are_penalised_alike(demos, monk
     for weight in (0.0, 0.5):
         _, learner = make(demos, logit="f", gradient_penalty=weight)
         slopes = iter((torch.tensor(3.0), torch.tensor(5.0)))
-        monkeypatch.setattr(airl, "gradient_penalty", lambda *_, slopes=slopes: next(slopes))
-        torch.manual_seed(0)
-        totals.append(learner._loss(risk, risk, 0.0, torch.Generator()).total.detach())
+        monkeypatch.setattr(
+            discriminator, "gradient_penalty", lambda *_, slopes=slopes: next(slopes)
+        )
+        loss = discriminator.minibatch_loss(
+            learner.model, risk, risk, torch.ones(1), learner.config, 0.0, torch.Generator()
+        )
+        totals.append(loss.total.detach())
     torch.testing.assert_close(totals[1] - totals[0], torch.tensor(0.5 * 4.0))
 
 
@@ -145,8 +158,14 @@ def challenged(demos, **changes):
     changes = {**CHALLENGED, **changes}
     trainer, learner = make(demos, horizon=HORIZON, total_steps=5 * 220 * 8, **changes)
     config = learner.config.challenger
-    worlds = trainer._venv.worlds
+    worlds = worlds_of(SETTINGS, LONG.n_envs, HORIZON)
     return trainer, learner, Challengers([worlds], config, learner, 0, "test")
+
+
+def weights_of(challengers):
+    """A copy of one layer of each challenger."""
+    trainers = challengers.state_dict()["trainers"]
+    return [next(iter(each["policy"].values())).clone() for each in trainers]
 
 
 def test_each_challenger_starts_from_other_random_weights(demos):
@@ -156,9 +175,8 @@ def test_each_challenger_starts_from_other_random_weights(demos):
         before = index % 2 == 0
         challengers.train_round(index)
         if before:
-            first.append(challengers._trainers[0].policy.state_dict())
-    weights = [next(iter(s.values())) for s in first]
-    assert not torch.equal(*weights)
+            first.append(weights_of(challengers)[0])
+    assert not torch.equal(*first)
 
 
 def test_each_settings_challenger_is_a_policy_of_its_own(demos):
@@ -177,8 +195,7 @@ def test_each_settings_challenger_is_a_policy_of_its_own(demos):
     for field in ("observations", "actions", "true_rewards", "returns"):
         np.testing.assert_array_equal(getattr(beside, field)[:, :4], getattr(alone, field))
     assert not np.array_equal(beside.observations[:, 4:], equal.observations[:, 4:])
-    weights = [next(iter(t.policy.state_dict().values())) for t in both._trainers]
-    assert not torch.equal(*weights)
+    assert not torch.equal(*weights_of(both))
 
 
 def test_challengers_per_setting_share_the_worlds_in_the_order_of_the_settings(
@@ -210,21 +227,14 @@ def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
     """Before the update a challenger's sample tells itself by its numbers: all are of one policy."""
     config = replace(CHALLENGED["challenger"], mixed_share=1.0)
     trainer, learner, challengers = challenged(demos, challenger=config, fixed_horizon=False)
-    seen = []
-    logits = airl.discriminator_logits
-
-    def record(model, batch, form):
-        seen.append(batch.observations[:, 0].detach().clone())
-        return logits(model, batch, form)
-
-    monkeypatch.setattr(airl, "discriminator_logits", record)
+    seen = record_losses(monkeypatch)
     rollouts, challenge = trainer.train_round(0, learner), challengers.train_round(0)
     learner.update(0, rollouts, trainer.policy, challenge)
     acted = {tuple(row) for r in rollouts for row in r.observations.reshape(-1, 8).tolist()}
     challenged_ = {tuple(row) for r in challenge for row in r.observations.reshape(-1, 8).tolist()}
     students, theirs = (
-        [{tuple(row) for row in batch.reshape(-1, 8).tolist()} for batch in seen[part:-1:2]]
-        for part in (0, 1)
+        [{tuple(row) for row in part.observations[:, 0].reshape(-1, 8).tolist()} for part in parts]
+        for parts in zip(*(minibatches[:2] for minibatches in seen), strict=True)
     )
     assert all(found <= acted for found in students)
     assert not any(found <= challenged_ for found in theirs)
@@ -296,8 +306,16 @@ def test_the_share_of_challengers_is_taken_from_the_student(demos, share):
     challenger = replace(CHALLENGED["challenger"], share=share)
     _, learner, _ = challenged(demos, grouping="per-setting", challenger=challenger)
     student, challengers = (a_batch(size, observations=8, actions=4) for size in (6, 10))
-    total = learner._loss(student, challengers, 0.0, torch.Generator()).total
     # Both settings weigh the same.
+    total = discriminator.minibatch_loss(
+        learner.model,
+        student,
+        challengers,
+        torch.full((2,), 0.5),
+        learner.config,
+        0.0,
+        torch.Generator(),
+    ).total
     own, other = (
         cross_entropy(discriminator.discriminator_logits(learner.model, batch, "f")[0]).mean()
         for batch in (student, challengers)
