@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 CLUSTERS = ("slurm", "local")
 DEFAULTS, DEFAULT_REQUEUES = Resources(), 20
+# submitit's local executor starts a job six times at most.
+LOCAL_REQUEUES = 5
 # Options of sbatch that every job has already, and the option of irl run that changes them.
 _SET_BY_IRL = {
     "array": "--array-parallelism",
@@ -84,6 +86,11 @@ class ClusterOptions(NamedTuple):
             raise UsageError(
                 f"{of_slurm[0]} needs --cluster slurm",
                 f"omit {of_slurm[0]}; --jobs sets how many jobs of --cluster local run at a time",
+            )
+        if self.cluster == "local" and (self.requeues or 0) > LOCAL_REQUEUES:
+            raise UsageError(
+                f"--cluster local requeues a job at most {LOCAL_REQUEUES} times",
+                f"--requeues {LOCAL_REQUEUES} or less; the same command again resumes",
             )
 
 
@@ -174,18 +181,16 @@ def run_jobs(
             f"--detach does not work with --cluster {queue.name}", "omit --detach: it must wait"
         )
     # A job that waits for another process would hold its node idle: it exits and is requeued.
-    impatient = ["--no-wait"] if session.wait else []
+    impatient = ["--no-wait"] if session.wait and queue.starts_what_waits else []
 
     def command(name: str) -> list[str]:
         return [sys.executable, "-m", "irlcli", *words(name), *impatient]
 
     display = job_display(session.console)
-    job = JobCommand(
-        command,
-        Path.cwd(),
-        DEFAULT_REQUEUES if options.requeues is None else options.requeues,
-        options.jobs or 1,
-    )
+    requeues = DEFAULT_REQUEUES if queue.starts_what_waits else LOCAL_REQUEUES
+    if options.requeues is not None:
+        requeues = options.requeues
+    job = JobCommand(command, Path.cwd(), requeues, options.jobs or 1)
     submission = Submission(found, runner, queue, job, display)
     try:
         count = submission.submit(
@@ -243,8 +248,9 @@ def print_status(session: StageSession, found: "Plan", options: ClusterOptions) 
             why = f"job {there[name].job} {place}"
             lines.append({"name": name, "state": state, "job": there[name].job, "why": why})
             continue
-        failures = (record.failure(name) for record in reversed(submissions))
-        failure = next((f for f in failures if f is not None), None)
+        # What the last job of this name said.
+        failures = (r.failure(name) for r in reversed(submissions) if r.has(name))
+        failure = next(failures, None)
         if failure is not None:
             lines.append({"name": name, "state": "FAILED", "job": None, "why": failure.message})
         else:

@@ -179,7 +179,8 @@ def run(
         int | None,
         typer.Option(
             min=0,
-            help=f"How often a stopped job is requeued. Default: {cluster_jobs.DEFAULT_REQUEUES}.",
+            help=f"How often a stopped job is requeued. Default: {cluster_jobs.DEFAULT_REQUEUES}; "
+            f"with --cluster local {cluster_jobs.LOCAL_REQUEUES}, its maximum.",
             rich_help_panel=_JOBS,
         ),
     ] = None,

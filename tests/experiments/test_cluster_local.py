@@ -98,6 +98,31 @@ def test_a_failure_stops_only_what_needs_it(runs, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_two_runs_of_one_table_start_each_step_once(plain, runs, tmp_path):
+    """With one job at a time each run comes to steps that the other one has started."""
+    store = tmp_path / "runs"
+    line = (store, "--cluster", "local", *REWARDS)
+    both = [runs.start(*line, IRL_TEST_ROUND="0.5") for _ in range(2)]
+    errors = [process.communicate(timeout=600)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], errors
+    assert Store(store).ids() == plain[0] and sorted(runs.processes()) == plain[1]
+    assert max(runs.computed().values()) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_submission_keeps_what_others_recorded(runs, tmp_path):
+    """The logs and the failures of jobs that have ended, and a record that has no job yet."""
+    store = tmp_path / "runs"
+    line = (store, "--cluster", "local", "--jobs", "4")
+    runs.run(*line, code=1, IRL_TEST_FAIL="train_airl pooled")
+    empty = new_record(Store(store), f"local on {os.uname().nodename}")
+    runs.run(*line, "--tag", "other", "--until", "experts", "--set", "expert.total_steps=999")
+    assert empty.logs.is_dir()
+    shown = runs.start(store, "--cluster", "local", "--status", "--json").communicate()[0]
+    assert json.loads(shown)["missing"][0]["state"] == "FAILED"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_path):
     """SIGUSR2 is what Slurm sends before a time limit, SIGTERM what it sends before a preemption."""
     store = tmp_path / "runs"
@@ -167,6 +192,7 @@ def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):
             ["--cluster", "local", "--array-parallelism", "9"],
             "--array-parallelism needs --cluster slurm",
         ),
+        (["--cluster", "local", "--requeues", "6"], "at most 5 times"),
         (["--cluster", "local", "--sbatch", "mem=4G"], "--sbatch needs --cluster slurm"),
         (["--status", "--cancel"], "exclude each other"),
         (["--status", "--out", "results"], "--status makes no step"),

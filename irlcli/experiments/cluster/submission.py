@@ -10,14 +10,7 @@ from irlcli.errors import StageFailed
 from irlcli.experiments.cluster.arrays import Array, job_arrays
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.queue import Queue, queued
-from irlcli.experiments.cluster.records import (
-    LOCK,
-    Record,
-    Submitted,
-    ended,
-    new_record,
-    remove,
-)
+from irlcli.experiments.cluster.records import LOCK, Record, Submitted, new_record
 from irlcli.experiments.execute import Display, Outcome
 from irlcli.experiments.failures import Failure
 from irlcli.experiments.plan import Plan
@@ -99,8 +92,6 @@ class Submission:
             self._queue.probe(store.root, waiting, warn)
             # The probe may have waited for hours.
             new = self._find_queued(missing)
-            states = {self._queue.place: self._queue.states()}
-            remove(ended(store, states.get, 0.0))
             absent = set(missing)
             needs = {name: [n for n in self._plan.needs[name] if n in absent] for name in new}
             self._arrays = job_arrays(needs)
@@ -237,14 +228,24 @@ class Submission:
         return all(self._exists(need) for need in self._plan.needs[name])
 
     def _start_ready(self, running: int) -> set[str]:
-        """Start jobs whose inputs exist, where the queue does not do so itself."""
+        """Start jobs whose inputs exist, where the queue does not do so itself; returns their steps.
+
+        A step that another submission has started meanwhile is watched instead.
+        """
+        waiting = [name for a in self._waiting for name in a.names if name not in self._ids]
+        ready = [name for name in waiting if self._ready(name)]
         started: set[str] = set()
-        for array in self._waiting:
-            for name in array.names:
-                if name in self._ids or running + len(started) >= self._command.at_a_time:
-                    continue
-                if self._ready(name):
-                    self._submit([name], (), None)
+        if ready and running < self._command.at_a_time:
+            store = self._runner.store
+            with store.working_on(LOCK, wait=True):
+                there = queued(self._plan, self._queue, store)
+                for name in ready:
+                    if name in there:
+                        self._ids[name], self._records[name] = there[name].job, there[name].record
+                    elif running + len(started) < self._command.at_a_time:
+                        self._submit([name], (), None)
+                    else:
+                        continue
                     started.add(name)
         self._waiting = [a for a in self._waiting if not self._ids.keys() >= set(a.names)]
         return started
