@@ -7,7 +7,7 @@ import typer
 from irlcli.cli import console as out
 from irlcli.cli.options import Env, Name, OneSetting, Seed, stage_command
 from irlcli.cli.session import StageSession
-from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured
+from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured, RegretSplit
 from irlcli.experiments import references
 from irlcli.requests import assess as requested
 from irlcli.store import Artefact
@@ -88,8 +88,7 @@ def print_assessment(assessment: Assessment) -> None:
     out.print_table(columns, [_ranked(s) for s in every], stderr=True)
     if assessment.epic_missing:
         out.print_note(f"no EPIC distance: {assessment.epic_missing}")
-    weak = assessment.weak_settings
-    for setting in weak:
+    for setting in assessment.weak_settings:
         out.print_note(
             f"{setting}: the expert earns no more than the random agent, so there is no verdict"
         )
@@ -99,7 +98,7 @@ def print_assessment(assessment: Assessment) -> None:
             r.policy,
             _measured(r.true_regret),
             _measured(r.learned_gap),
-            "-" if s.setting in weak else r.verdict + ("" if r.clear else ", uncertain"),
+            _verdict(assessment.verdicts(s.setting).get(r.policy)),
             "-" if r.ceiling is None else f"{r.ceiling:g}",
         ]
         for s in assessment.settings
@@ -115,6 +114,12 @@ def print_assessment(assessment: Assessment) -> None:
             "ceiling",
         ]
         out.print_table(columns, splits, stderr=True)
+
+
+def _verdict(of: RegretSplit | None) -> str:
+    if of is None:
+        return "-"
+    return of.verdict if of.clear else f"{of.verdict}, uncertain"
 
 
 def _ranked(found: Assessed) -> list[str]:

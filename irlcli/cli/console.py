@@ -24,7 +24,9 @@ JSON_VERSION = 1
 _PLAIN_SECONDS = 10.0
 _MAX_MESSAGE, _MAX_HINT = 900, 4000
 # Printed text may come from a file. It must not control the terminal or fake a second line.
-_CONTROLS = dict.fromkeys([*range(32), *range(127, 160), *range(0x202A, 0x202F)], "?")
+_CONTROLS = dict.fromkeys(
+    [*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)], "?"
+)
 _CONTROLS_BUT_NEWLINE = {code: c for code, c in _CONTROLS.items() if code != ord("\n")}
 
 

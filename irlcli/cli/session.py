@@ -18,22 +18,6 @@ if TYPE_CHECKING:
     from irlcli.stages.base import Request
 
 
-# The parts of a config that a stage and its command read. Challengers learn with the PPO of retrained
-# policies, clones also have the student's network, and a collected expert is compared with the bar. What
-# other stages read is not checked: a bank, say, is looked for under the whole config.
-_SECTIONS = {
-    "train-expert": {"expert"},
-    "collect-experts": {"demonstrations", "expert", "gridworld"},
-    "train-airl": {"airl", "transfer.ppo"},
-    "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
-    "clone": {"airl.actions", "clone"},
-    "train-maxent": {"maxent"},
-    "transfer": {"transfer"},
-    "evaluate": {"evaluation"},
-    "import": set[str](),
-}
-
-
 class Session(base.Session):
     """The store that a command reads, and how it prints."""
 
@@ -113,7 +97,6 @@ class StageSession(base.StageSession):
         quiet: bool,
         tensorboard: Path | None,
     ):
-        _check_repeated(overrides)
         super().__init__(
             store,
             out.TerminalConsole(quiet, tensorboard),
@@ -173,23 +156,15 @@ class StageSession(base.StageSession):
         """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold."""
         if not self.overrides:
             return
-        from irlcli.requests.overrides import behind, replaced
+        from irlcli.requests.overrides import behind, replaced, unread
 
         every = [made for request in requests for made in behind(request)]
         for line in replaced(self.overrides, every):
             self.console.warn(line)
         stages = {request.stage.name for request in every}
-        if not stages <= _SECTIONS.keys():
-            return
-        read = set[str]().union(*(_SECTIONS[stage] for stage in stages))
-        if "clone" in stages:
-            from irlcli.stages.clone import Network
-
-            read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
-        for item in self.overrides:
-            field = item.partition("=")[0].strip()
-            if not any(f"{field}.".startswith(f"{part}.") for part in read):
-                self.console.warn(f"no stage of this command reads --set {item}")
+        # A bank is looked for under the whole config.
+        for item in () if "assess" in stages else unread(self.overrides, stages):
+            self.console.warn(f"no stage of this command reads --set {item}")
 
     def prepare(self, request: "Request") -> Artefact | None:
         """The artefact of ``request``, not printed.
@@ -233,15 +208,3 @@ class StageSession(base.StageSession):
             "outputs": [output.path for output in artefact.manifest.outputs],
         }
         out.print_json("artefact", document | dict(details(artefact) if details else {}))
-
-
-def _check_repeated(overrides: Sequence[str]) -> None:
-    """Refuse a field that ``--set`` names twice: only the last value would count.
-
-    Raises:
-        UsageError: naming the field.
-    """
-    fields = [item.partition("=")[0].strip() for item in overrides]
-    for field in fields:
-        if fields.count(field) > 1:
-            raise UsageError(f"--set {field} is given twice", f"give {field} once")

@@ -302,6 +302,15 @@ class Assessment(Struct, frozen=True, kw_only=True):
                 found.append(s.setting)
         return found
 
+    def verdicts(self, setting: str) -> dict[str, RegretSplit]:
+        """The policies retrained in ``setting`` on which there is a verdict, by name.
+
+        None in a weak setting.
+        """
+        if setting in self.weak_settings:
+            return {}
+        return {r.policy: r for s in self.settings if s.setting == setting for r in s.retrained}
+
 
 class HintContrast(Struct, frozen=True, kw_only=True):
     """How a reward depends on each hint of :mod:`irlcli.envs.cue` in one setting.

@@ -1,7 +1,7 @@
 """The tables and figures of ``settings/experiments.toml``: rows, methods, seeds and measures."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -100,9 +100,34 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
     defaults = tree.pop(_DEFAULTS, {})
     try:
         _check_fields(defaults, _DEFAULTS, ("methods", "seeds"))
-        return {name: _table(name, value, defaults, path.parent) for name, value in tree.items()}
+        tables = {name: _table(name, value, defaults, path.parent) for name, value in tree.items()}
+        _check_names(tables.values())
+        return tables
     except (UsageError, NotFound) as error:
         raise type(error)(f"{path}: {error.message}", error.hint) from None
+
+
+def _check_names(tables: Iterable[Table]) -> None:
+    """Refuse two tables whose steps have one name and another config.
+
+    Tables without settings of their own share the names of equal rows and methods.
+    """
+    first: dict[tuple[Row, str], tuple[str, Any]] = {}
+    for table in tables:
+        if table.settings is not None:
+            continue
+        changed: dict[str, Any] = {m: table.penalty_weights.get(m) for m in table.methods}
+        if table.variants:
+            changed = {v.name: (table.methods, v.overrides) for v in table.variants}
+        for row in table.rows:
+            for name, config in changed.items():
+                other, same = first.setdefault((row, name), (table.name, config))
+                if same != config:
+                    raise UsageError(
+                        f"{other} and {table.name} both have {name} in {row}, under the same names "
+                        "with another config",
+                        f"give {table.name} settings of its own, or rename the variant",
+                    )
 
 
 def load_table(name: str, path: Path | None = None) -> Table:

@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from irlcli import labels
+from irlcli.data.descriptions import Assessment
 from irlcli.errors import UsageError
 from irlcli.report.returns import as_json
 from irlcli.requests.evaluate import measured
@@ -89,10 +92,11 @@ class Stored:
 
 def _bank(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     """Mean returns of each policy in each setting, with standard errors, and the verdict on it."""
+    whole = msgspec.convert(assessment, Assessment)
     verdicts = {
-        (assessed["setting"], split["policy"]): split["verdict"]
-        for assessed in assessment["settings"]
-        for split in assessed["retrained"]
+        (of.setting, policy): split.verdict
+        for of in whole.settings
+        for policy, split in whole.verdicts(of.setting).items()
     }
     return [
         {

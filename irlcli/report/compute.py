@@ -87,11 +87,12 @@ def points_of(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.Da
 def between_retrainings(points: pd.DataFrame, row: str, agent: str, measure: str) -> float | None:
     """Deviation (n - 1) of the true return between policies trained on one reward, pooled.
 
-    The root of the mean variance over rewards; None if no reward was retrained twice.
+    The root of the mean variance over rewards and the settings that policies are trained in; None if
+    no reward was retrained twice in one setting.
     """
     chosen = points_of(points, row, agent, measure)
-    means = chosen.groupby(["seed", "retraining"])["true_return"].mean()
-    variances = means.groupby("seed").var().dropna()
+    means = chosen.groupby(["seed", "setting", "retraining"])["true_return"].mean()
+    variances = means.groupby(["seed", "setting"]).var().dropna()
     return float(np.sqrt(variances.mean())) if len(variances) else None
 
 
@@ -184,7 +185,8 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     """A row per row, measure and pair of methods (x, y), over seeds with every evaluation.
 
     Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means; two-sided p-values
-    ``p_welch`` (primary), ``p_welch_holm`` (over the rows), ``p_paired`` (over the ``pairs`` seeds
+    ``p_welch`` (primary), ``p_welch_holm`` (over the rows, of an ablation over the rows and variants),
+    ``p_paired`` (over the ``pairs`` seeds
     that both methods have), ``p_student`` and ``p_rank`` (Mann-Whitney); ``improvement``, the
     probability that a seed of x beats one of y; ``not_imitated``, which of the two failed in
     distribution; ``why``, the reason for a missing Welch test.
@@ -192,19 +194,23 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     pairs = [(v.name, p.variants[0].name) for v in p.variants[1:]] or comparisons(p.methods)
     students = cells[(cells["measure"] == "id") & cells["agent"].isin(p.methods)]
     failed = {(r.row, r.agent) for r in students.itertuples() if failed_to_imitate(r)}
+    families = [pairs] if p.variants else [[pair] for pair in pairs]
     found = []
     for measure in p.measures:
-        for x, y in pairs:
+        for family in families:
+            tests = [(x, y, row) for x, y in family for row in p.rows]
             samples = [
                 [
                     whole_sample(p, points, row.name, agent, measure)["true_return"]
                     for agent in (x, y)
                 ]
-                for row in p.rows
+                for x, y, row in tests
             ]
             tested = [compare(a.tolist(), b.tolist()) for a, b in samples]
             adjusted = holm([c.welch for c in tested])
-            for row, (a, b), c, p_holm in zip(p.rows, samples, tested, adjusted, strict=True):
+            for (x, y, row), (a, b), c, p_holm in zip(
+                tests, samples, tested, adjusted, strict=True
+            ):
                 common = a.index.intersection(b.index)
                 found.append(
                     {
@@ -236,7 +242,8 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     ``retrained`` and ``expert``, mean learned returns of the retrained policies and of the held-out
     setting's expert; ``short``, the policies that fall short of the expert, and
     ``short_scored_higher``, those of them because of a wrong reward: see
-    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return.
+    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return. None
+    falls short of an expert that is no better than the random agent.
     """
     counted = ["seeds", "policies", "retrained", "expert", "short", "short_scored_higher"]
     columns = ["row", "agent", *counted]
@@ -252,10 +259,12 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
                 continue
-            verdicts = [_verdict(r, random) for r in both.itertuples()]
+            verdicts = [
+                _verdict(r, random) for r in both.itertuples() if r.true_return_expert > random
+            ]
             scores = both[["learned_return", "learned_return_expert"]]
             means = map(float, scores.groupby(both["seed"]).mean().mean())
-            counts = len(both) - verdicts.count("retrained"), verdicts.count("wrong reward")
+            counts = len(verdicts) - verdicts.count("retrained"), verdicts.count("wrong reward")
             seeds = both["seed"].nunique()
             found.append((row.name, method, seeds, len(both), *means, *counts))
     return pd.DataFrame(found, columns=columns)
@@ -283,11 +292,7 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
             "spearman_low": value(s.lower_half.spearman),
             "expert_minus_idle": s.expert_minus_idle and s.expert_minus_idle.mean,
             "return_distance": s.return_distance,
-            "verdicts": [
-                r.verdict
-                for r in s.retrained
-                if not r.from_student and s.setting not in of.weak_settings
-            ],
+            "verdicts": [r.verdict for r in of.verdicts(s.setting).values() if not r.from_student],
         }
         for row in p.rows
         for method in p.methods

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -90,16 +90,17 @@ def _points(p: Parameters, report: Report) -> Figure:
         for axis, row in zip(line, p.rows, strict=True):
             _panel(axis, p, report, row, measure)
         line[0].set_ylabel(f"true return, {measure}")
-    _add_legend(figure, axes[0, 0])
+    _add_legend(figure, axes.flat)
     return figure
 
 
 def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) -> None:
     ink = matplotlib.rcParams["text.color"]
     cells = report.cells[report.cells["row"] == row.name].set_index(["agent", "measure"])
-    for agent in BASELINES:
-        # Drawn even without a value, because all panels share the first one's legend.
-        value = cells["mean"].get((agent, "id" if measure in IN_DISTRIBUTION else "ood"))
+    there = measure in IN_DISTRIBUTION
+    # Drawn even without a value, so that the legend has it.
+    for agent in ("expert", "reused") if there else BASELINES:
+        value = cells["mean"].get((agent, "id" if there else "ood"))
         axis.axhline(
             np.nan if pd.isna(value) else value,
             color=ink,
@@ -136,7 +137,7 @@ def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) ->
         range(len(p.methods)), [title(m).replace(", ", ",\n") for m in p.methods], size=7.5
     )
     axis.set_xlim(-0.6, len(p.methods) - 0.4)
-    axis.set_title(f"{row.env} {row.unseen}")
+    axis.set_title(row.name if there else f"{row.env} {row.unseen}")
     axis.grid(axis="y", alpha=0.25)
 
 
@@ -180,7 +181,8 @@ def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> Figu
                 for one in series:
                     axis.plot(one.index / 1e6, one, color=colour, lw=0.6, alpha=0.45)
                 if series:
-                    mean = pd.concat(series, axis=1).mean(axis=1)
+                    # As far as all seeds go: training may end early.
+                    mean = pd.concat(series, axis=1, join="inner").mean(axis=1)
                     label = f"{title(method)} ({len(series)})"
                     axis.plot(mean.index / 1e6, mean, color=colour, lw=1.7, label=label)
             axis.grid(alpha=0.25)
@@ -192,13 +194,19 @@ def _curves(p: Parameters, runs: Mapping[tuple[str, int], pd.DataFrame]) -> Figu
         axis.set_title(setting)
     for axis in axes[-1]:
         axis.set_xlabel("million steps")
-    _add_legend(figure, axes[0, 0])
+    _add_legend(figure, axes.flat)
     return figure
 
 
-def _add_legend(figure: Figure, axis: Axes) -> None:
+def _add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     """One legend for all panels, below them, in as many columns as the figure is wide enough for."""
-    handles, labels = axis.get_legend_handles_labels()
+    entries = {
+        label: handle
+        for axis in axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
     # An entry takes up to 1.8 inches; the layout cuts what does not fit.
     columns = max(1, min(6, int(figure.get_figwidth() / 1.8)))
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside lower center", ncols=columns, frameon=False
+    )

@@ -59,7 +59,8 @@ _QUALITY_NOTE = (
     "policy's learned return is at least the expert's; else optimisation fell short."
 )
 _COMPARISON_NOTE = (
-    "Two-sided p-values. Welch's test is the primary one. Paired: t-test over the seeds that both "
+    "Two-sided p-values. Welch's test is the primary one. Holm: adjusted over the rows, separately for "
+    "each measure and pair of methods; in an ablation over all rows and variants of a measure. Paired: t-test over the seeds that both "
     "methods have (their number in brackets), which share initialisation and starts; - where the "
     "differences do not vary or fewer than two pairs exist. Student's test assumes equal variances; "
     "the paper used it (its value is recomputed from its means and deviations, n = 5). Rank: the Mann-Whitney test, on the order of the seeds alone; three against "
@@ -370,7 +371,10 @@ def budgets(p: Parameters) -> Table:
         )
     columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda", "round"]
     columns += ["transfer steps", "from the student", "evaluation episodes"]
-    return Table("Budgets", _BUDGET_NOTE, columns, lines)
+    note = _BUDGET_NOTE
+    if p.variants:
+        note += f" Of the variant {p.variants[0].name}; the others may differ."
+    return Table("Budgets", note, columns, lines)
 
 
 def costs(p: Parameters) -> Table:

@@ -22,12 +22,11 @@ class Row(NamedTuple):
     """One agent in one setting, a sample over seeds.
 
     Attributes:
-        returns: mean true return of each seed.
-        episodes: per seed.
-        progress: mean over seeds; None if the environment reports none.
-        learned: mean learned return over seeds; None if no reward was given.
-        policies: number of distinct policies. One policy under several rewards is no sample of
+        returns: mean true return of each policy. One policy under several rewards is no sample of
             true returns.
+        episodes: per seed.
+        progress: mean over policies; None if the environment reports none.
+        learned: mean learned return over policies and rewards; None if no reward was given.
     """
 
     agent: str
@@ -37,7 +36,6 @@ class Row(NamedTuple):
     episodes: int
     progress: float | None = None
     learned: float | None = None
-    policies: int = 1
 
     @property
     def mean(self) -> float:
@@ -47,7 +45,7 @@ class Row(NamedTuple):
     @property
     def deviation(self) -> float | None:
         """Standard deviation over seeds (n - 1); None for one policy."""
-        if self.policies < 2:
+        if len(self.returns) < 2:
             return None
         squares = math.fsum((x - self.mean) ** 2 for x in self.returns)
         return math.sqrt(squares / (len(self.returns) - 1))
@@ -99,18 +97,13 @@ def rows(evaluations: Iterable[Measured]) -> list[Row]:
             groups.setdefault(key, {})[tuple(seeds)] = values
     found = []
     for (_, agent, env, setting), items in sorted(groups.items()):
-        returns, episodes, progress, learned = zip(*items.values(), strict=True)
+        _, episodes, progress, learned = zip(*items.values(), strict=True)
+        policies: dict[Any, list[float]] = {}
+        for (seed, *_), (true_return, *_) in items.items():
+            policies.setdefault(seed, []).append(true_return)
+        returns = tuple(math.fsum(each) / len(each) for each in policies.values())
         found.append(
-            Row(
-                agent,
-                env,
-                setting,
-                returns,
-                min(episodes),
-                _mean(progress),
-                _mean(learned),
-                policies=len({seed for seed, *_ in items}),
-            )
+            Row(agent, env, setting, returns, min(episodes), _mean(progress), _mean(learned))
         )
     return found
 

@@ -8,7 +8,7 @@ from irlcli.data.descriptions import Evaluation
 from irlcli.data.descriptions import Reward as RewardDescription
 from irlcli.errors import UsageError
 from irlcli.experiments import references
-from irlcli.interventions import Setting, check_observed, parse_setting
+from irlcli.interventions import Setting, check_observed, parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import Session, StageSession
 from irlcli.stages import evaluate as stage
@@ -165,6 +165,9 @@ def _of_agent(
         experts = [(setting, settings) for setting in trained]
         for setting, measured in experts:
             check_observed(env, [str(setting)], measured)
+        # Settings that differ in their cue only have one expert.
+        worlds = {str(own): own for own in (without_cue(env, setting) for setting in trained)}
+        experts = [(own, settings) for own in worlds.values()]
     return [
         stage.request(
             env,

@@ -10,6 +10,25 @@ from irlcli.configs.load import overridden
 from irlcli.configs.schema import UNSET_MEANS
 from irlcli.stages.base import From, Request
 
+# The parts of a config that a stage and its command read. Challengers learn with the PPO of retrained
+# policies, clones also have the student's network, and a collected expert is compared with the bar.
+_SECTIONS = {
+    "assess": {"assessment"},
+    "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
+    "clone": {"airl.actions", "clone"},
+    "collect-experts": {"demonstrations", "expert", "gridworld"},
+    "control-labels": {"control"},
+    "control-maps": {"control"},
+    "evaluate": {"evaluation"},
+    "import": set[str](),
+    "measure-cue": {"evaluation"},
+    "record": {"assessment"},
+    "sweep-maxent": {"maxent", "figure2"},
+    "train-airl": {"airl", "transfer.ppo"},
+    "train-expert": {"expert"},
+    "train-maxent": {"maxent"},
+    "transfer": {"transfer"},
+}
 # A policy that begins as the student holds these values under the fields that they replace.
 _OF_STUDENTS = "transfer.from_student."
 
@@ -42,6 +61,22 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
         if held and _shown(field, value) not in held:
             values = " or ".join(sorted(text for text in held if text))
             yield f"--set {item} has no effect: the other values make it {values}"
+
+
+def unread(overrides: Sequence[str], stages: Iterable[str]) -> Iterator[str]:
+    """The overrides whose field none of ``stages`` reads; none if one of them is not known here."""
+    names = {*stages}
+    if not names <= _SECTIONS.keys():
+        return
+    read = set[str]().union(*(_SECTIONS[name] for name in names))
+    if "clone" in names:
+        from irlcli.stages.clone import Network
+
+        read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
+    for item in overrides:
+        field = item.partition("=")[0].strip()
+        if not any(f"{field}.".startswith(f"{part}.") for part in read):
+            yield item
 
 
 def _by_section(request: Request) -> Any:

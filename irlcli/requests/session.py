@@ -91,7 +91,7 @@ class StageSession(Session):
         workers: processes that step environments.
 
     Raises:
-        UsageError: an unknown profile.
+        UsageError: an unknown profile, or a field that ``overrides`` set twice.
     """
 
     def __init__(
@@ -111,6 +111,7 @@ class StageSession(Session):
         from irlcli.configs import check_profile
 
         check_profile(profile)
+        _check_repeated(overrides)
         super().__init__(store, console, wait, read_only)
         self.profile = profile
         self.file = file
@@ -207,3 +208,11 @@ class StageSession(Session):
         None if nothing may be run, and it is missing.
         """
         return self.run([request])[0]
+
+
+def _check_repeated(overrides: Sequence[str]) -> None:
+    """Refuse a field that ``--set`` names twice: only the last value would count."""
+    fields = [item.partition("=")[0].strip() for item in overrides]
+    for field in fields:
+        if fields.count(field) > 1:
+            raise UsageError(f"--set {field} is given twice", f"give {field} once")

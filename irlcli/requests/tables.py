@@ -9,23 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from irlcli.configs.load import in_profile, read_toml
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
-from irlcli.requests.overrides import replaced
+from irlcli.requests.overrides import replaced, unread
 from irlcli.requests.session import StageSession, check_path
 
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
     from irlcli.experiments.status import Step
-    from irlcli.experiments.tables import Kind, Table
+    from irlcli.experiments.tables import Table
 
-# The sections of a config that the steps of each kind of table read.
-_SECTIONS: "dict[Kind, set[str]]" = {
-    "comparison": {
-        *("expert", "demonstrations", "airl", "transfer", "evaluation", "clone", "assessment")
-    },
-    "experts": {"expert", "evaluation"},
-    "figure2": {"gridworld", "maxent", "figure2"},
-    "control": {"control"},
-}
 # In a name, which may have 100 characters in all.
 _LONGEST_PART = 50
 
@@ -168,11 +159,13 @@ def _check_weights(session: StageSession, table: "Table") -> None:
 
 
 def _warn_of_unread(session: StageSession, plan: "Plan") -> None:
-    for line in replaced(session.overrides, [task.request for task in plan.tasks.values()]):
+    if not session.overrides:
+        return
+    requests = [task.request for task in plan.tasks.values()]
+    for line in replaced(session.overrides, requests):
         session.console.warn(line)
-    for item in session.overrides:
-        if item.partition(".")[0].strip() not in _SECTIONS[plan.table.kind]:
-            session.console.warn(f"no step of {plan.table.name} reads --set {item}")
+    for item in unread(session.overrides, {request.stage.name for request in requests}):
+        session.console.warn(f"no step of {plan.table.name} reads --set {item}")
 
 
 def _weights_in(tree: Mapping[str, Any], knobs: Set[str]) -> Iterator[str]:

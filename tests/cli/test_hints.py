@@ -249,6 +249,9 @@ def test_a_field_that_no_stage_of_the_command_reads_is_named(irl, smoke_store, l
         ("experts", "transfer.ceiling=0.5", True),
         ("table1", "maxent.l2=1", True),
         ("table1", "airl.bc_epochs=3", False),
+        ("table1", "clone.epochs=3", True),
+        ("gates", "clone.epochs=3", False),
+        ("gates", "assessment.noise=[0.5]", False),
         ("figure2", "maxent.iterations=9", False),
     ],
 )

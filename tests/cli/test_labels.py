@@ -149,6 +149,16 @@ def test_labels_of_evaluations_distinguish_policies(irl, store_copy, tmp_path):
         assert f"evaluate expert of {own} in lunar-lander engine-power=1.5x seed 0" in plan
 
 
+def test_settings_that_differ_in_their_cue_have_one_expert(irl, tmp_path):
+    line = ["evaluate", "--expert", "--trained-in", "cue-strength=0.9,0.8", *SMOKE, "--dry-run"]
+    line += ["--env", "lunar-lander", "--ood", "cue-strength=0.1", "--store", tmp_path / "runs"]
+    done = irl(*line)
+    assert done.code == 0, done.err
+    expert, evaluation = done.out.splitlines()
+    assert "train-expert lunar-lander engine-power=1x" in expert
+    assert "evaluate expert of engine-power=1x in lunar-lander cue-strength=0.1" in evaluation
+
+
 def test_state_only_can_be_switched_off(irl, smoke_store, tmp_path):
     (tmp_path / "on.toml").write_text("[airl]\nstate_only = true")
     plans = [

@@ -86,6 +86,16 @@ def test_a_table_overrides_the_defaults(tables):
     assert (other.methods, other.seeds) == (("irm",), (7,))
 
 
+def test_two_tables_do_not_give_two_results_one_name(tables, tmp_path):
+    other = SOUND.partition("[mine]")[2].replace("Mine", "Other")
+    assert {*tables(f"{SOUND}\n[other]{other}")} == {"mine", "other"}
+    weighed = f"{SOUND}\n[other]{other}\npenalty_weights = {{irm = 3}}\n"
+    with pytest.raises(UsageError, match="mine and other both have irm in"):
+        tables(weighed)
+    (tmp_path / "own.toml").write_text("")
+    tables(weighed + 'settings = "own.toml"\n')
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message", "hint"),
     [

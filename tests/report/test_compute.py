@@ -124,6 +124,18 @@ def test_only_policies_that_fall_short_count_as_scored_higher(returns, short):
     assert any(c.startswith("Short of") for c in report.caveats) == (short > 0)
 
 
+def test_beside_an_expert_no_better_than_random_none_falls_short():
+    values = complete() | {(BOUNCE, "erm", "transfer"): [5.0] * 3}
+    values[BOUNCE, "erm", EXPERT_BY_REWARD] = [10.0] * 3
+    values[BOUNCE, "random", "ood"] = [50.0]
+    p, points = example(values)
+    points["learned_return"] = 0.0
+    report = build(p, points, {}, {})
+    (found,) = report.learned_returns.itertuples()
+    assert (found.policies, found.short, found.short_scored_higher) == (3, 0, 0)
+    assert not any(c.startswith("Short of") for c in report.caveats)
+
+
 def test_every_retrained_policy_of_a_reward_is_judged():
     """Of two policies on one reward one is as good as the expert; their mean would be short, too."""
     values = complete() | {(BOUNCE, "erm", "transfer"): [280.0, 280.0, 280.0]}

@@ -140,6 +140,17 @@ def test_the_student_in_distribution_is_plotted_if_nothing_else_is_measured(tmp_
     assert "true return, id" in svg
 
 
+def test_policies_of_the_training_settings_are_not_drawn_under_the_held_out_one(tmp_path):
+    p, points = example(complete(), measures=("transfer", "transfer-id"))
+    unseen = f"{p.rows[0].env} {p.rows[0].unseen}"
+    svg = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
+    # Titles of two panels.
+    assert svg.count(unseen) == 1 and svg.count(BOUNCE) == 2
+    p, points = example(complete(), measures=("transfer-id",))
+    svg = plots.draw_points(tmp_path, p, build(p, points, {}, {}))
+    assert unseen not in svg and ">random<" not in svg
+
+
 def test_learning_curves_have_a_plot_per_row_and_kind():
     p, _ = example(complete())
     recorded = metrics(0.9, 0.1, 1.0)

@@ -53,6 +53,24 @@ def test_retrainings_are_averaged_and_their_spread_is_told_apart():
     )
 
 
+def test_retrainings_in_several_settings_do_not_average_their_spread_away():
+    """The policies of each setting differ by 10: variances of 50, whatever the other setting's are."""
+    values = complete()
+    p, points = example(values, measures=MEASURES, retrainings=2)
+    points = points[points["measure"] != "transfer-id"]
+    report = with_points(
+        p,
+        points,
+        *(
+            ("irm", "transfer-id", 0, k, setting, value)
+            for setting, pair in (("bounce=0.1", (0.0, 10.0)), ("bounce=0.5", (20.0, 10.0)))
+            for k, value in enumerate(pair)
+        ),
+    )
+    found = cell(report, BOUNCE, "irm", "transfer-id")["between_retrainings"]
+    assert found == pytest.approx(50.0**0.5)
+
+
 def test_retraining_in_distribution_is_a_share_of_each_settings_own_expert():
     values = complete()
     del values[BOUNCE, "expert", "id"]
@@ -131,6 +149,8 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
     report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): weak})
     assert report.reward_quality["verdicts"].tolist() == [[]]
     assert any("bounce=0.9 the expert earns no more" in caveat for caveat in report.caveats)
+    assert set(assessment.verdicts("bounce=0.9")) == {"begun as a student", "the other"}
+    assert weak.verdicts("bounce=0.9") == {}
 
 
 def test_the_budget_of_retraining_from_the_student_is_listed():

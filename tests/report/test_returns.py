@@ -108,7 +108,7 @@ def test_returns_under_another_reward_are_a_row_of_their_own():
     other = "under AIRL-IRM's reward"
     assert {row.agent: (row.learned, len(row.returns), row.deviation) for row in found} == {
         # One expert under two rewards is no sample of true returns.
-        f"expert {other}": (-3.0, 2, None),
+        f"expert {other}": (-3.0, 1, None),
         "AIRL-IRM student, zero-shot": (6.0, 1, None),
         "AIRL-IRM retrained policy": (7.0, 1, None),
         f"AIRL-IRM retrained policy {other}": (8.5, 2, 0.0),
@@ -119,6 +119,18 @@ def test_returns_under_another_reward_are_a_row_of_their_own():
         UsageError, match=r"reward in bounce=0\.9 has seed 0 under the reward of seed 4 twice"
     ):
         rows(twice)
+
+
+def test_policies_under_several_rewards_count_once_each():
+    summaries = []
+    for policy, mean in ((0, 0.0), (1, 10.0)):
+        for reward in range(3):
+            summary, made, own = evaluation("expert", mean, policy)
+            origin = RewardOrigin(method="irm", seed=reward, settings=("bounce=0.1",))
+            summaries.append((msgspec.structs.replace(summary, reward=origin), made, own))
+    (row,) = rows(summaries)
+    assert row.returns == (0.0, 10.0)
+    assert row.deviation == pytest.approx(50.0**0.5)
 
 
 def test_a_repeated_seed_is_refused():
