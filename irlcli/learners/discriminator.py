@@ -175,6 +175,11 @@ def penalty_weight_at(index: int, weight: float, warmup: int, ramp: int) -> floa
     return weight * min(1.0, (index - warmup + 1) / max(1, ramp))
 
 
+def full_weight_from(warmup: int, ramp: int) -> int:
+    """The first round whose lambda is the whole weight."""
+    return warmup + max(1, ramp) - 1
+
+
 @torch.no_grad()
 def measured(
     model: RewardModel,

@@ -15,6 +15,9 @@ import torch
 from irlcli.learners.pools import Minibatch
 from irlcli.symmetries import Symmetries
 
+# Mapped at a time. 4096 matrices of 105 x 105, those of MuJoCo's Ant, are 181 MB.
+_ROWS = 4096
+
 
 class Images:
     """Draws an image of each sample, every element of the group with the same probability.
@@ -65,4 +68,7 @@ class Images:
 
 def _mapped(maps: torch.Tensor, values: torch.Tensor, elements: torch.Tensor) -> torch.Tensor:
     """``maps`` [K, D, D] of ``elements`` [...] applied to ``values`` [..., D]."""
-    return torch.matmul(maps[elements], values.unsqueeze(-1)).squeeze(-1)
+    # In parts: each row has a matrix of its own.
+    rows = zip(elements.flatten().split(_ROWS), values.flatten(0, -2).split(_ROWS), strict=True)
+    found = [torch.matmul(maps[e], v.unsqueeze(-1)).squeeze(-1) for e, v in rows]
+    return torch.cat(found).reshape(values.shape)

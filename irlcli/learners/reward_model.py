@@ -115,8 +115,7 @@ class RewardModel(nn.Module):
         An absorbing state offers no choice: its action vector is zero and log pi is zero, so
         f = g + (gamma - 1) h.
         """
-        none = torch.zeros(*observations.shape[:-1], self.action_size)
-        g = self.reward(observations, none)
+        g = absorbed(self, observations)
         if self.h is None:
             return g, g
         h = self.h(self._seen(observations))[..., 0]
@@ -159,6 +158,12 @@ class AveragedReward(nn.Module):
 
 # What is frozen.
 RewardModule = RewardModel | AveragedReward
+
+
+def absorbed(model: RewardModule, observations: torch.Tensor) -> torch.Tensor:
+    """g [B] of the absorbing states that keep ``observations`` [B, D]: their action vector is zero."""
+    none = observations.new_zeros(*observations.shape[:-1], model.action_size)
+    return model.reward(observations, none)
 
 
 def build(members: int = 1, **shape: Any) -> RewardModule:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from irlcli.learners.pools import Pool, make_pool
-from irlcli.learners.reward_model import RewardModel, RewardModule
+from irlcli.learners.reward_model import RewardModel, RewardModule, absorbed
 from irlcli.trajectories import Transitions
 
 # Of g: a constant reward has no scale.
@@ -70,8 +70,7 @@ def transformed_reward(
         reward = transform(model.reward(torch.as_tensor(data.observations), actions))
         terminated = torch.as_tensor(data.terminated, dtype=torch.float32)
         if absorbing and bool(terminated.any()):
-            final = torch.as_tensor(data.next_observations)
-            g = model.reward(final, torch.zeros(len(final), model.action_size))
+            g = absorbed(model, torch.as_tensor(data.next_observations))
             reward = reward + absorbing_value(transform(g), terminated, gamma)
         return reward
 

@@ -26,13 +26,23 @@ class BestRound:
         score: of a policy; higher is better.
         learner: its reward is kept with the policy (``snapshot``, ``load_snapshot``).
         every: rounds between two scores; the last of ``rounds`` is always scored.
+        first: round, before which none is scored: a reward learned without the penalty is not the
+            method's.
     """
 
-    def __init__(self, score: Callable[[Any], float], learner: Any, every: int, rounds: int):
+    def __init__(
+        self,
+        score: Callable[[Any], float],
+        learner: Any,
+        every: int,
+        rounds: int,
+        first: int = 0,
+    ):
         self._score = score
         self._learner = learner
         self._every = every
         self._rounds = rounds
+        self._first = first
         self.best: dict[str, Any] = {}
 
     def consider(self, index: int, policy: Any) -> dict[str, float]:
@@ -41,7 +51,8 @@ class BestRound:
         Raises:
             StageFailed: the score is not a finite number.
         """
-        if (index + 1) % self._every and index + 1 != self._rounds:
+        due = index >= self._first and (index + 1) % self._every == 0
+        if not due and index + 1 != self._rounds:
             return {"score": float("nan")}
         score = self._score(policy)
         if not math.isfinite(score):

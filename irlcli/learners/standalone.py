@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from irlcli.learners.reward_model import RewardModule
+from irlcli.learners.reward_model import RewardModule, absorbed
 from irlcli.learners.scoring import absorbing_value
 
 
@@ -63,7 +63,6 @@ class StandaloneReward(nn.Module):
         vectors = self.model.encode(actions)
         reward = self.model.reward(observations, vectors).clamp(max=self._ceiling)
         if self._absorbing:
-            none = observations.new_zeros(observations.shape[0], self.model.action_size)
-            final = self.model.reward(next_observations, none).clamp(max=self._ceiling)
+            final = absorbed(self.model, next_observations).clamp(max=self._ceiling)
             reward = reward + absorbing_value(final, terminated.float(), self._gamma)
         return reward / self._scale

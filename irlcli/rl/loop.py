@@ -197,14 +197,16 @@ class Training:
         """Train to the last round, or to where ``ends`` says so, and return all rows.
 
         ``after_round`` gets each round's rows. After the round that reaches ``until`` environment
-        steps training stops; another call continues it.
+        steps training stops, with the networks of that round; another call continues it.
         """
         if self.rounds_done == 0:
             self.learner.begin(self.trainer)
         for index in range(self.rounds_done, self.trainer.rounds):
             # Here, not at the end: a resumed run may have been killed after its last round.
-            if self._ends(self.rows) or (until is not None and self.steps >= until):
+            if self._ends(self.rows):
                 break
+            if until is not None and self.steps >= until:
+                return self.rows
             rollouts = self.trainer.train_round(index, self.source)
             challenge = [] if self.challengers is None else self.challengers.train_round(index)
             diagnostics = self.learner.update(index, rollouts, self.trainer.policy, challenge)

@@ -11,7 +11,7 @@ from irlcli.configs import Config, GridworldConfig
 from irlcli.data.descriptions import MOST_EPISODES
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, check_observed, parse_setting
+from irlcli.interventions import Setting, check_observed, parse_setting, without_cue
 from irlcli.stages import train_expert
 from irlcli.stages.base import (
     EnvironmentKey,
@@ -172,7 +172,8 @@ def _expert(job: Job, text: str) -> Policy:
         return load_policy_file(path)[0]
     beside = job.inputs.get(f"{_NORMALISER} {text}")
     saved, *statistics = (File(str(f), f.read_bytes()) for f in (path, beside) if f)
-    return load_saved(saved, env, parse_setting(env, text), *statistics)
+    # It acts in the world without a cue, as every expert does.
+    return load_saved(saved, env, without_cue(env, parse_setting(env, text)), *statistics)
 
 
 def run_tabular(job: Job) -> None:

@@ -46,6 +46,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     airl: AIRLConfig
     penalty_version: int | msgspec.UnsetType = msgspec.UNSET
+    selection_version: int | msgspec.UnsetType = msgspec.UNSET
 
 
 def request(
@@ -102,6 +103,7 @@ def request(
         seed=seed,
         airl=relevant,
         penalty_version=penalty_version(relevant.penalty),
+        selection_version=_selection_version(relevant),
     )
     check_risks(parameters.airl.penalty, parameters.airl.grouping, trained)
     label = f"train-airl {describe(parameters.airl)} {env} {', '.join(texts)} seed {seed}"
@@ -121,6 +123,12 @@ def describe(airl: AIRLConfig) -> str:
 def reward_label(airl: AIRLConfig, seed: int) -> str:
     """A learned reward, for the labels of what is made with it."""
     return f"{describe(airl)} seed {seed}"
+
+
+def _selection_version(airl: AIRLConfig) -> int | msgspec.UnsetType:
+    """In keys where a round is selected from those with a penalty."""
+    # 2: none is selected before lambda has its full value.
+    return 2 if airl.select != "last" and airl.penalty != "none" else msgspec.UNSET
 
 
 def _check_selection(airl: AIRLConfig, settings: Sequence[str]) -> None:
@@ -150,7 +158,7 @@ def _check_rounds(airl: AIRLConfig) -> None:
             f"--set airl.averaged_rounds={rounds} or less, or --set airl.total_steps="
             f"{averaged * airl.ppo.steps_per_round} or more",
         )
-    # Rounds that the plateau can be found in, before the last.
+    # Rounds that count towards a plateau; stopping in the last round saves nothing.
     compared = rounds - 1 - airl.penalty_warmup_rounds - airl.penalty_ramp_rounds
     if airl.plateau_rounds and 2 * airl.plateau_rounds > compared:
         largest = compared // 2
@@ -323,6 +331,7 @@ def _selector(
     """What decides which round is kept, by ``airl.select``."""
     import numpy as np
 
+    from irlcli.learners.discriminator import full_weight_from
     from irlcli.learners.selection import BestRound, log_likelihood
     from irlcli.rl.loop import LastRound
     from irlcli.rl.rollout import roll_out
@@ -343,7 +352,8 @@ def _selector(
         return float(np.mean([t.episode_return for t in found]))
 
     score = likelihood if airl.select == "episodes" else true_return
-    return BestRound(score, learner, airl.select_every, rounds)
+    first = full_weight_from(airl.penalty_warmup_rounds, airl.penalty_ramp_rounds)
+    return BestRound(score, learner, airl.select_every, rounds, first)
 
 
 def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping[str, Any]]], bool]:

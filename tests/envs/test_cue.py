@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import PPO
 
-from irlcli.envs.cue import TEXTURE, CueWorld, Rightness, qualities, with_hints
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.envs.cue import HINTS, TEXTURE, CueWorld, Rightness, qualities, with_hints
 from irlcli.envs.registration import make
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.envs.spec import Cue
 from irlcli.envs.vector import VectorWorlds
-from irlcli.interventions import cue_in, parse_setting, without_cue
+from irlcli.interventions import Setting, cue_in, parse_setting, without_cue
 from irlcli.rl.worlds import make_worlds
 from irlcli.trajectories import Trajectory
 
@@ -161,3 +164,19 @@ def test_worker_processes_draw_the_same_hints():
             first = worlds.reset(range(4))
             seen.append([first, *(worlds.step(np.full(4, 2))[0] for _ in range(80))])
     assert np.array_equal(*seen)
+
+
+def test_a_saved_expert_of_the_plain_world_demonstrates_with_a_cue(irl, tmp_path):
+    model = PPO(
+        "MlpPolicy", make("lunar-lander", Setting()), n_steps=16, batch_size=16, device="cpu"
+    )
+    model.save(tmp_path / "ppo.zip")
+    done = irl(
+        *("collect-experts", "--env", "lunar-lander", "--setting", "cue-strength=0.95", "--trust"),
+        *("--expert", f"cue-strength=0.95={tmp_path / 'ppo.zip'}", "--profile", "smoke"),
+        *("--store", tmp_path / "runs"),
+    )
+    assert done.code == 0, done.err
+    demos = read_demonstrations(Path(done.out.strip()))
+    (episodes,) = demos.trajectories.values()
+    assert {t.observations.shape[1] for t in episodes} == {8 + len(HINTS)}

@@ -12,6 +12,8 @@ from irlcli.configs import AIRLConfig, PPOConfig
 from irlcli.configs.relevance import relevant_airl
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
+from irlcli.learners.airl import AIRL
+from irlcli.learners.gail import GAIL
 from irlcli.learners.selection import log_likelihood
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
@@ -75,6 +77,24 @@ def test_a_policy_is_rewarded_for_the_actions_that_were_executed(demos):
     assert (abs(rollout.actions) > 1).any()
     rewards = learner.rewards(rollout, trainer.policy)
     np.testing.assert_array_equal(rewards, learner.rewards(further, trainer.policy))
+
+
+@pytest.mark.parametrize("kind", [AIRL, GAIL])
+def test_rewards_of_actions_beyond_the_bounds_are_those_of_the_bounds(demos, kind):
+    """g(s, a) of a challenger, and of GAIL's policy."""
+    trainer, learner = make(
+        demos, CONFIG, REACHER, SETTINGS, kind=kind, actions="executed", logit="f", shaping=False
+    )
+    (rollout,) = trainer.train_round(0, learner)
+    beyond = abs(rollout.actions) > 1
+    further = replace(rollout, actions=np.where(beyond, 9 * rollout.actions, rollout.actions))
+    assert beyond.any()
+    paid = {
+        AIRL: learner.challenger_rewards,
+        GAIL: lambda r: learner.rewards(r, trainer.policy),
+    }[kind]
+    np.testing.assert_array_equal(paid(rollout), paid(further))
+    trainer.model.get_env().close()
 
 
 def test_likelihoods_of_held_out_episodes_are_of_the_same_actions(demos):

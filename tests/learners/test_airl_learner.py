@@ -131,6 +131,42 @@ def test_observations_are_normalised_by_demonstrations_and_rollouts(demos):
     np.testing.assert_allclose(learner.model.normaliser.mean, seen.mean(0), rtol=1e-6)
 
 
+def test_samples_have_log_pi_of_the_present_policy_replayed_ones_too(demos, monkeypatch):
+    """Paper Eq. 2. An absorbing state offers no choice: its action vector and log pi are zero."""
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, replay_share=0.5)
+    drawn = record_losses(monkeypatch)
+    absorbed = 0
+    for index in range(3):
+        rollouts = trainer.train_round(index, learner)
+        learner.update(index, rollouts, trainer.policy)
+        while drawn:
+            batch, _, _ = drawn.pop()
+            chosen = batch.actions.sum(-1) > 0
+            absorbed += int((~chosen).sum())
+            expected = trainer.policy.log_prob(
+                batch.observations[chosen], batch.actions[chosen].argmax(-1)
+            )
+            torch.testing.assert_close(batch.log_probs[chosen], expected, atol=1e-5, rtol=1e-5)
+            assert (batch.log_probs[~chosen] == 0.0).all()
+    assert absorbed > 0
+
+
+def test_the_student_earns_f_minus_log_pi(demos):
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, fixed_horizon=False)
+    (rollout,) = trainer.train_round(0, learner)
+    data = rollout.transitions(slice(None), HORIZON)
+    with torch.no_grad():
+        f = learner.model(
+            torch.as_tensor(data.observations),
+            learner.model.encode(torch.as_tensor(data.actions)),
+            torch.as_tensor(data.next_observations),
+            torch.as_tensor(data.terminated, dtype=torch.float32),
+        )
+    expected = f.numpy() - rollout.log_probs.ravel()
+    earned = learner.rewards(rollout, trainer.policy).ravel()
+    np.testing.assert_allclose(earned, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_the_scale_is_the_deviation_of_g_over_demonstrations_and_rollouts(demos):
     learner, data = observed(demos)
     with torch.no_grad():
@@ -310,6 +346,18 @@ def challenged(demos, symmetries=None, **changes):
     trainer, learner = make(demos, horizon=HORIZON, symmetries=symmetries, **parts)
     worlds = worlds_of(SETTINGS, LONG.n_envs, HORIZON)
     return trainer, learner, Challengers([worlds], parts["challenger"], learner, 0, "test")
+
+
+def test_observations_of_challengers_are_normalised_too(demos):
+    trainer, learner, challengers = challenged(demos, fixed_horizon=False)
+    rollouts = trainer.train_round(0, learner)
+    theirs = [moved(r, 5.0) for r in challengers.train_round(0)]
+    learner.update(0, rollouts, trainer.policy, theirs)
+    generated, challenge = (
+        whole_episodes(r, np.ones(8, bool), HORIZON)[0] for r in (rollouts, theirs)
+    )
+    seen = join([generated, challenge, shown(demos)]).observations.astype(float)
+    np.testing.assert_allclose(learner.model.normaliser.mean, seen.mean(0), rtol=1e-5)
 
 
 def test_each_replay_has_its_own_sizes(demos):

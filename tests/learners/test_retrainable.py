@@ -24,12 +24,14 @@ from irlcli.data.tensors import load_reward_file
 from irlcli.errors import UsageError
 from irlcli.learners import airl, discriminator
 from irlcli.learners.pools import Minibatch
+from irlcli.learners.replay import whole_episodes
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions
 from irlcli.penalties.risk import cross_entropy
 from irlcli.rl import worlds as worlds_module
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.worlds import make_worlds
+from irlcli.trajectories import join, transitions
 
 LONG = PPOConfig(n_envs=8, n_steps=220, batch_size=512, n_epochs=1)
 HORIZON = 200
@@ -160,6 +162,19 @@ def challenged(demos, **changes):
     config = learner.config.challenger
     worlds = worlds_of(SETTINGS, LONG.n_envs, HORIZON)
     return trainer, learner, Challengers([worlds], config, learner, 0, "test")
+
+
+def test_a_challengers_learning_rate_falls_over_its_life(demos):
+    ppo = replace(LONG, learning_rate=1e-3, learning_rate_schedule="linear")
+    config = replace(CHALLENGED["challenger"], life=4, ppo=ppo)
+    _, _, challengers = challenged(demos, challenger=config)
+    rates = []
+    for index in range(5):
+        challengers.train_round(index)
+        (state,) = challengers.state_dict()["trainers"]
+        rates.append(state["optimizer"]["param_groups"][0]["lr"])
+    # Set before each update, by the share of the steps that is left. The next life begins anew.
+    assert rates == pytest.approx([0.75e-3, 0.5e-3, 0.25e-3, 0.0, 0.75e-3])
 
 
 def weights_of(challengers):
@@ -369,7 +384,12 @@ def test_the_number_of_worlds_a_challenger_is_configured_with_does_not_matter():
 
 def test_the_deployed_reward_is_the_mean_over_equally_spaced_rounds(demos, tmp_path):
     trainer, learner = make(
-        demos, ppo=LONG, horizon=HORIZON, total_steps=6 * 220 * 8, averaged_rounds=3
+        demos,
+        ppo=LONG,
+        horizon=HORIZON,
+        total_steps=6 * 220 * 8,
+        averaged_rounds=3,
+        fixed_horizon=False,
     )
     assert trainer.rounds == 6
     after = []
@@ -380,7 +400,13 @@ def test_the_deployed_reward_is_the_mean_over_equally_spaced_rounds(demos, tmp_p
     states, actions = torch.randn(7, 8) * 3, torch.eye(4)[torch.randint(4, (7,))]
     expected = sum(after[index].reward(states, actions) for index in (1, 3, 5)) / 3
     torch.testing.assert_close(learner.deployed.reward(states, actions), expected)
-    # The level that a ceiling refers to is that of the mean, too.
+    # The scale, and the level that a ceiling refers to, are those of the mean, too.
+    generated, _ = whole_episodes([rollout], np.ones(8, bool), HORIZON)
+    data = join([generated, transitions([*demos[0], *demos[1]], HORIZON)])
+    with torch.no_grad():
+        vectors = learner.model.encode(torch.as_tensor(data.actions))
+        g = learner.deployed.reward(torch.as_tensor(data.observations), vectors)
+    assert learner.scale == pytest.approx(float(g.double().std()), rel=1e-4)
     shown = torch.as_tensor(np.concatenate([t.observations[:-1] for t in demos[0] + demos[1]]))
     taken = torch.eye(4)[np.concatenate([t.actions for t in demos[0] + demos[1]])]
     assert learner.quantiles[-1] >= float(learner.deployed.reward(shown, taken).max()) - 1e-5

@@ -14,6 +14,7 @@ from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
 from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.errors import StageFailed
 from irlcli.experiments.runner import Silent
+from irlcli.learners.discriminator import full_weight_from, penalty_weight_at
 from irlcli.learners.selection import BestRound, hold_out, log_likelihood
 from irlcli.rl.rollout import roll_out
 from irlcli.stages import choose_penalty
@@ -54,6 +55,45 @@ def test_the_first_of_the_best_rounds_is_kept_and_put_back(networks):
         assert torch.equal(tensor, reward["model"][name])
     assert learner.scale == reward["scale"]
     assert not all(torch.equal(policy[k], states[6][0][k]) for k in policy)
+
+
+def test_no_round_before_the_full_penalty_is_kept(networks):
+    """A clone scores best at once, when the reward is still that of ERM."""
+    trainer, learner = networks
+    assert [full_weight_from(warmup, ramp) for warmup, ramp in ((0, 0), (2, 1), (2, 3))] == [
+        0,
+        2,
+        4,
+    ]
+    for warmup, ramp in ((0, 0), (2, 1), (2, 3)):
+        first = full_weight_from(warmup, ramp)
+        weights = [penalty_weight_at(index, 8.0, warmup, ramp) for index in range(first + 1)]
+        assert weights[-1] == 8.0 and 8.0 not in weights[:-1]
+    given = iter([3.0, 2.0])
+    best = BestRound(lambda policy: next(given), learner, every=1, rounds=5, first=3)
+    scores = [best.consider(index, trainer.policy)["score"] for index in range(5)]
+    assert all(map(math.isnan, scores[:3])) and scores[3:] == [3.0, 2.0]
+    assert best.best["round"] == 3
+    # The last round is always scored.
+    short = BestRound(lambda policy: 1.0, learner, every=1, rounds=2, first=3)
+    for index in range(2):
+        short.consider(index, trainer.policy)
+    assert short.best["round"] == 1
+
+
+def test_the_penalty_of_a_selected_round_is_the_whole_one(store_copy, irl):
+    done = irl(
+        *("train-airl", "--demos", "demos", "--store", store_copy.path, "--profile", "smoke"),
+        *("--select", "episodes", "--set", "airl.select_every=1", "--method", "irm", "--json"),
+        *("--set", "airl.penalty_warmup_rounds=1", "--set", "airl.penalty_ramp_rounds=2"),
+    )
+    assert done.code == 0, done.err
+    made = store_copy.path / json.loads(done.out)["id"]
+    rows = pq.read_table(made / "metrics.parquet").to_pylist()
+    weights = {row["round"]: row["penalty_weight"] for row in rows}
+    scored = {row["round"] for row in rows if not math.isnan(row["score"])}
+    assert scored == {index for index, w in weights.items() if w == max(weights.values())}
+    assert 0 < len(scored) < len(weights)
 
 
 @pytest.mark.parametrize("score", [math.nan, math.inf])

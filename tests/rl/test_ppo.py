@@ -75,6 +75,24 @@ def test_rollouts_hold_true_successors_and_the_sampling_policys_log_probs():
         assert changed.any(-1).all()
 
 
+def test_moments_change_after_the_update_only():
+    """Otherwise the policy that is updated would not be the one that acted."""
+    trainer = make_trainer(normalise_observations=True)
+    normaliser = trainer.model.policy.features_extractor.normaliser
+    counts = []
+    update = trainer.model.train
+
+    def train():
+        counts.append(float(normaliser.count))
+        update()
+
+    trainer.model.train = train
+    trainer.train_round(0, TrueReward())
+    before = counts[0]
+    assert counts == [before, before + PPO.n_envs * PPO.n_steps]
+    assert float(normaliser.count) == before + 2 * PPO.n_envs * PPO.n_steps
+
+
 def test_returns_are_those_of_whole_episodes():
     rollout = make_trainer(limit=40).train_round(0, TrueReward())[0]
     world = 1

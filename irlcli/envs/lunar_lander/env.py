@@ -42,7 +42,8 @@ class LunarLander(original.LunarLander):
         engine_power: multiplier of the main engine's impulse, above 0 (original: 1).
         fixed_horizon: if a number H, every episode is truncated after exactly H steps. A state
             that would terminate becomes absorbing: its observation is repeated, actions have no
-            effect, and the reward is 0.
+            effect, and the reward is 0. Not what ``airl.fixed_horizon`` switches on, which pays
+            such states the learned reward in closed form.
         render_mode: ``None``, ``"human"`` or ``"rgb_array"``.
 
     Raises:
