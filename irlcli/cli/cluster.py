@@ -141,7 +141,7 @@ def _sbatch_option(item: str) -> tuple[str, str]:
     return name, value
 
 
-def _queue_of(session: StageSession, found: "Plan", options: ClusterOptions) -> "Queue":
+def _queue_of(session: StageSession, plan: "Plan", options: ClusterOptions) -> "Queue":
     """The queue that ``--cluster`` names, or the one that has the plan's jobs.
 
     Raises:
@@ -151,13 +151,13 @@ def _queue_of(session: StageSession, found: "Plan", options: ClusterOptions) -> 
 
     if options.cluster is not None:
         return open_queue(session, options)
-    place = last_place(found, session.store)
+    place = last_place(plan, session.store)
     # Without a record there is no job: Slurm need not be asked.
     slurm = place is not None and place.startswith("slurm ")
     queue = open_queue(session, options._replace(cluster="slurm" if slurm else "local"))
     if place not in (None, queue.place):
         raise UsageError(
-            f"{found.table.name} was submitted to: {place}. This machine has: {queue.place}",
+            f"{plan.table.name} was submitted to: {place}. This machine has: {queue.place}",
             "run the same command there, or name a queue of this machine with --cluster",
         )
     return queue
@@ -166,7 +166,7 @@ def _queue_of(session: StageSession, found: "Plan", options: ClusterOptions) -> 
 def run_jobs(
     session: StageSession,
     runner: "Runner",
-    found: "Plan",
+    plan: "Plan",
     words: Callable[[str], list[str]],
     options: ClusterOptions,
     detach: bool,
@@ -191,7 +191,7 @@ def run_jobs(
     if options.requeues is not None:
         requeues = options.requeues
     job = JobCommand(command, Path.cwd(), requeues, options.jobs or 1)
-    submission = Submission(found, runner, queue, job, display)
+    submission = Submission(plan, runner, queue, job, display)
     try:
         count = submission.submit(
             lambda: session.console.say("a probe job checks the store from a node"),
@@ -201,7 +201,7 @@ def run_jobs(
             session.console.say(f"{out.counted(count, 'job')} submitted")
         if detach:
             if session.as_json:
-                out.print_json("submission", {"table": found.table.name, "submitted": count})
+                out.print_json("submission", {"table": plan.table.name, "submitted": count})
             return None
         return submission.watch()
     finally:
@@ -228,18 +228,18 @@ def ended_submissions(session: Session, grace_seconds: float) -> list[Path]:
     return ended(session.store, states_at, grace_seconds)
 
 
-def print_status(session: StageSession, found: "Plan", options: ClusterOptions) -> None:
+def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -> None:
     """A line for each step that does not exist: its job, or why there is none."""
     from irlcli.experiments.cluster.queue import queued
     from irlcli.experiments.cluster.records import records
 
-    queue = _queue_of(session, found, options)
-    there = queued(found, queue, session.store)
+    queue = _queue_of(session, plan, options)
+    there = queued(plan, queue, session.store)
     submissions = records(session.store, queue.place)
     lines: list[dict[str, str | None]] = []
     exist = 0
-    for name in found.tasks:
-        step = found.step(name)
+    for name in plan.tasks:
+        step = plan.step(name)
         if step.status == "HIT":
             exist += 1
             continue
@@ -256,23 +256,23 @@ def print_status(session: StageSession, found: "Plan", options: ClusterOptions) 
         else:
             lines.append({"name": name, "state": step.status, "job": None, "why": step.why})
     if session.as_json:
-        out.print_json("status", {"table": found.table.name, "exist": exist, "missing": lines})
+        out.print_json("status", {"table": plan.table.name, "exist": exist, "missing": lines})
         return
     for line in lines:
         out.print_data(f"{line['state']:11}{line['name']}: {line['why']}")
     jobs = sum(line["job"] is not None for line in lines)
-    out.print_note(f"{exist} of {len(found.tasks)} steps exist, {jobs} have a job")
+    out.print_note(f"{exist} of {len(plan.tasks)} steps exist, {jobs} have a job")
 
 
-def cancel(session: StageSession, found: "Plan", options: ClusterOptions) -> None:
+def cancel(session: StageSession, plan: "Plan", options: ClusterOptions) -> None:
     """Cancel the jobs of a table; those that run write a checkpoint first."""
     from irlcli.experiments.cluster.queue import queued
 
-    queue = _queue_of(session, found, options)
-    there = queued(found, queue, session.store)
+    queue = _queue_of(session, plan, options)
+    there = queued(plan, queue, session.store)
     queue.cancel(sorted({job.job for job in there.values()}))
     if session.as_json:
-        out.print_json("cancel", {"table": found.table.name, "jobs": len(there)})
+        out.print_json("cancel", {"table": plan.table.name, "jobs": len(there)})
         return
     after = "; those that ran leave a checkpoint" if there else ""
     out.print_note(f"{out.counted(len(there), 'job')} cancelled{after}")

@@ -4,7 +4,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -86,23 +86,23 @@ def plan(
     if to is not None and session.as_json:
         raise UsageError("--to prints no JSON", "omit --json or --to")
     choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
-    found = open_plan(session, choice)
+    plan = open_plan(session, choice)
     check_tag(session, choice)
     if to is None:
-        _print_plan(session, choice, found)
+        _print_plan(session, choice, plan)
         return
     from irlcli.experiments.snakemake import snakefile
 
-    command = _child_words(session, choice, found)
-    needs = {name: found.needs[name] for name in found.tasks}
+    command = _child_words(session, choice, plan)
+    needs = {name: plan.needs[name] for name in plan.tasks}
     line = shlex.join(["irl", *sys.argv[1:]])
     out.print_data(snakefile(needs, lambda name: ["irl", *command(name)], line).rstrip())
 
 
-def _print_plan(session: StageSession, choice: Choice, found: "Plan") -> None:
-    steps, counts = steps_of(found), found.counts()
+def _print_plan(session: StageSession, choice: Choice, plan: "Plan") -> None:
+    steps, counts = steps_of(plan), plan.counts()
     if session.as_json:
-        command = _child_words(session, choice, found)
+        command = _child_words(session, choice, plan)
         for step in steps:
             step["command"] = ["irl", *command(step["name"])]
         out.print_json("plan", {"table": choice.table, "counts": counts, "steps": steps})
@@ -206,7 +206,9 @@ def run(
     )
     if status + cancel + detach > 1:
         raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
-    about_jobs = "status" * status + "cancel" * cancel
+    about_jobs: Literal["status", "cancel"] | None = (
+        "status" if status else "cancel" if cancel else None
+    )
     _check_options(session, choice, directory, options, about_jobs, detach)
     options.check_used(detach)
     if session.dry_run and (status or cancel):
@@ -214,29 +216,29 @@ def run(
             "--dry-run shows the plan, not the jobs", "omit --dry-run, or --status and --cancel"
         )
     runner = session.runner()
-    found = open_plan(session, choice)
+    plan = open_plan(session, choice)
     if session.dry_run:
-        _print_plan(session, choice, found)
+        _print_plan(session, choice, plan)
         return
     if status or cancel:
-        (cluster_jobs.print_status if status else cluster_jobs.cancel)(session, found, options)
+        (cluster_jobs.print_status if status else cluster_jobs.cancel)(session, plan, options)
         return
     runner.store.create()
     with session.reading():
         if only is not None:
-            _make_one(session, runner, found, only)
+            _make_one(session, runner, plan, only)
             return
         if cluster is None:
-            outcome = _make_all(session, runner, found, choice, jobs or 1)
+            outcome = _make_all(session, runner, plan, choice, jobs or 1)
         else:
-            words = _child_words(session, choice, found)
-            ended = cluster_jobs.run_jobs(session, runner, found, words, options, detach)
+            words = _child_words(session, choice, plan)
+            ended = cluster_jobs.run_jobs(session, runner, plan, words, options, detach)
             if ended is None:
                 return
             outcome = ended
         if not outcome.interrupted and until is None:
-            _report(session, runner, found, choice, directory, outcome)
-    _raise_for(outcome, found, _JOBS_GO_ON if cluster == "slurm" else _CONTINUE)
+            _report(session, runner, plan, choice, directory, outcome)
+    _raise_for(outcome, plan, _JOBS_GO_ON if cluster == "slurm" else _CONTINUE)
     if session.as_json and until is not None:
         counts = {field: len(getattr(outcome, field)) for field in ("existed", "copied", "made")}
         out.print_json("run", {"table": table, **counts})
@@ -247,12 +249,12 @@ def _check_options(
     choice: Choice,
     directory: Path | None,
     options: ClusterOptions,
-    about_jobs: str,
+    about_jobs: Literal["status", "cancel"] | None,
     detach: bool,
 ) -> None:
     """Refuse options that contradict each other, or would be ignored, before any work.
 
-    ``about_jobs`` is ``status``, ``cancel`` or empty.
+    ``about_jobs`` is the option that asks about jobs, None if none does.
 
     Raises:
         UsageError: names them.
@@ -272,16 +274,16 @@ def _check_options(
         check_out(directory, session.store.root)
 
 
-def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str) -> None:
+def _make_one(session: StageSession, runner: "Runner", plan: "Plan", only: str) -> None:
     """Make one step and what it needs in this process, inputs first."""
     try:
-        for name in list(found.tasks):
-            step = found.step(name)
+        for name in list(plan.tasks):
+            step = plan.step(name)
             artefact = step.artefact if step.status == "HIT" and name != only else None
             if artefact is None:
-                artefact = runner.run(found.tasks[name].request)
+                artefact = runner.run(plan.tasks[name].request)
                 # A choice of lambda decides what the next requests are.
-                found.refresh()
+                plan.refresh()
             runner.store.set_name(name, artefact)
             if name == only:
                 session.print_artefact(artefact, only)
@@ -290,28 +292,26 @@ def _make_one(session: StageSession, runner: "Runner", found: "Plan", only: str)
 
 
 def _make_all(
-    session: StageSession, runner: "Runner", found: "Plan", choice: Choice, jobs: int
+    session: StageSession, runner: "Runner", plan: "Plan", choice: Choice, jobs: int
 ) -> "Outcome":
     from irlcli.cli.jobs import job_display
     from irlcli.experiments.execute import Execution
 
-    words = _child_words(session, choice, found)
+    words = _child_words(session, choice, plan)
     display = job_display(session.console)
 
     def command(name: str) -> list[str]:
         return [sys.executable, "-m", "irlcli", *words(name)]
 
     try:
-        return Execution(found, runner, command, jobs, display).run()
+        return Execution(plan, runner, command, jobs, display).run()
     finally:
         display.close()
 
 
-def _child_words(
-    session: StageSession, choice: Choice, found: "Plan"
-) -> Callable[[str], list[str]]:
+def _child_words(session: StageSession, choice: Choice, plan: "Plan") -> Callable[[str], list[str]]:
     """The command line that makes one step, by its name."""
-    words = [*session.config_words(), *choice.words(), "--tag", found.selection.tag]
+    words = [*session.config_words(), *choice.words(), "--tag", plan.selection.tag]
     words += session.place_words()
 
     def command(name: str) -> list[str]:
@@ -323,14 +323,14 @@ def _child_words(
 def _report(
     session: StageSession,
     runner: "Runner",
-    found: "Plan",
+    plan: "Plan",
     choice: Choice,
     directory: Path | None,
     outcome: "Outcome",
 ) -> None:
-    found.lookup.forget_missing()
+    plan.lookup.forget_missing()
     try:
-        request = report_of(session, choice, found)
+        request = report_of(session, choice, plan)
     except NotFound:
         if outcome.failed:
             # The failures are reported, and they are the reason.
@@ -340,7 +340,7 @@ def _report(
         artefact = runner.run(request)
     finally:
         session.console.close()
-    name = choice.report_name(found.selection.tag)
+    name = choice.report_name(plan.selection.tag)
     runner.store.set_name(name, artefact)
     if directory is not None:
         copy_outputs(session, artefact, directory)
@@ -349,7 +349,7 @@ def _report(
         print_report(session, artefact)
 
 
-def _raise_for(outcome: "Outcome", found: "Plan", continue_hint: str) -> None:
+def _raise_for(outcome: "Outcome", plan: "Plan", continue_hint: str) -> None:
     """End with the exit code of what went wrong; the hint is for a run that a signal stopped.
 
     Raises:
@@ -357,7 +357,7 @@ def _raise_for(outcome: "Outcome", found: "Plan", continue_hint: str) -> None:
     """
     if not outcome.exit_code:
         return
-    total = len(found.tasks)
+    total = len(plan.tasks)
     there = len(outcome.existed) + len(outcome.copied) + len(outcome.made)
     if outcome.interrupted:
         error: IrlError = Interrupted(f"stopped: {there} of {total} steps exist", continue_hint)

@@ -10,8 +10,9 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from queue import Empty, SimpleQueue
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from irlcli.errors import Interrupted
 from irlcli.experiments.failures import LAST_LINES, Failure, failure
@@ -25,15 +26,16 @@ _POLL_SECONDS = 0.05
 _SEVERITY = (75, 130, 3, 2, 1, 4)
 
 
-class Outcome(NamedTuple):
+@dataclass
+class Outcome:
     """The result of each step, by name."""
 
-    existed: list[str]
-    copied: list[str]
-    made: list[str]
-    failed: dict[str, Failure]
-    blocked: list[str]
-    interrupted: bool
+    existed: list[str] = field(default_factory=list)
+    copied: list[str] = field(default_factory=list)
+    made: list[str] = field(default_factory=list)
+    failed: dict[str, Failure] = field(default_factory=dict)
+    blocked: list[str] = field(default_factory=list)
+    interrupted: bool = False
 
     @property
     def exit_code(self) -> int:
@@ -41,7 +43,8 @@ class Outcome(NamedTuple):
         if self.interrupted:
             return 130
         codes = {failure.code for failure in self.failed.values()}
-        return max(codes, key=lambda c: _SEVERITY.index(c) if c in _SEVERITY else 4, default=0)
+        # A code of none of our errors is a crash.
+        return max(codes, key=lambda c: _SEVERITY.index(c if c in _SEVERITY else 1), default=0)
 
 
 class Display(Protocol):
@@ -143,7 +146,7 @@ class Execution:
         self._lines: SimpleQueue = SimpleQueue()
         self._signals = 0
         self._passed_on = 0
-        self._outcome = Outcome([], [], [], {}, [], False)
+        self._outcome = Outcome()
 
     def run(self) -> Outcome:
         """Make the missing steps, several at a time, until all exist or nothing more can be made."""
@@ -159,7 +162,7 @@ class Execution:
                 finally:
                     for child in self._running.values():
                         child.stop(at_once=True)
-        return self._outcome._replace(blocked=self._waiting, interrupted=self._signals > 0)
+        return replace(self._outcome, blocked=self._waiting, interrupted=self._signals > 0)
 
     def _loop(self) -> None:
         while True:

@@ -35,11 +35,13 @@ def snakefile(
         made_by: the command line to mention in the first line.
     """
     rules: dict[str, str] = {}
+    used: set[str] = set()
     for name in needs:
         rule = re.sub(r"\W", "_", name)
         # Two names that differ only in signs.
-        while rule in rules.values():
+        while rule in used:
             rule += "_"
+        used.add(rule)
         rules[name] = rule
     everything = ",\n".join(f"        {_done(name)}" for name in needs)
     text = _HEAD.format(made_by=made_by.replace("\n", " "), everything=everything)

@@ -114,8 +114,8 @@ def write_mp4(path: Path, played: Film) -> None:
     """Write ``played`` as H.264 video; frames are encoded as they are drawn.
 
     Raises:
-        StageFailed: imageio-ffmpeg is not installed, or ffmpeg failed.
-        OSError: ``path`` cannot be written.
+        StageFailed: imageio-ffmpeg is not installed.
+        OSError: ``path`` cannot be written, or ffmpeg failed.
     """
     try:
         from imageio_ffmpeg import write_frames

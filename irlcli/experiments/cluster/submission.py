@@ -3,6 +3,7 @@
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,7 +68,7 @@ class Submission:
         self._lost: set[str] = set()
         self._explained: set[str] = set()
         self._signals = 0
-        self._outcome = Outcome([], [], [], {}, [], False)
+        self._outcome = Outcome()
 
     def submit(self, waiting: Callable[[], None], warn: Callable[[str], None]) -> int:
         """Submit what is missing and not in the queue; returns how many jobs that are.
@@ -152,7 +153,7 @@ class Submission:
                 self._stop_jobs(alive, running)
         done = {*self._outcome.existed, *self._outcome.copied, *self._outcome.made}
         blocked = [n for n in self._plan.tasks if n not in done and n not in self._outcome.failed]
-        return self._outcome._replace(blocked=blocked, interrupted=self._stopped)
+        return replace(self._outcome, blocked=blocked, interrupted=self._stopped)
 
     def _stop_jobs(self, alive: set[str], running: Mapping[str, float]) -> None:
         """Cancel jobs that nobody else starts again, and wait until they have ended."""
