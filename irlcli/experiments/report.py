@@ -143,7 +143,7 @@ def _reason(plan: Plan, request: Request) -> str:
 
 def _curve_role(cell: Cell, part: str) -> str:
     if cell.agent == "expert":
-        return f"{cell.row.split()[0]} {cell.place} {part}"
+        return f"{cell.env} {cell.place} {part}"
     return f"{cell.row} {cell.agent} {cell.seed} {part}"
 
 

@@ -47,7 +47,7 @@ def summarise(
     for cell in cells:
         if cell.agent != "expert":
             continue
-        env, knob = cell.row.split()
+        env, knob = cell.env, cell.knob
         expert, idle, random = (
             summaries.get((agent, env, cell.place)) for agent in ("expert", "idle", "random")
         )
@@ -102,7 +102,7 @@ def text_table(found: pd.DataFrame) -> Table:
 def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
     """Experts that do not reach the bar of their row, and missing ones."""
     experts = [cell for cell in cells if cell.agent == "expert"]
-    missing = [f"{cell.row.split()[0]} {cell.place}" for cell in experts if not cell.run]
+    missing = [f"{cell.env} {cell.place}" for cell in experts if not cell.run]
     low = [
         f"{row.env} {row.setting} ({row.true_return:.0f} of {bar:.0f})"
         for row in found.itertuples()
@@ -139,7 +139,7 @@ def draw(directory: Path, cells: Sequence[Cell], learning: Mapping[str, pd.DataF
     """
     curves: dict[str, list[tuple[Cell, pd.DataFrame]]] = {}
     for cell in cells:
-        metrics = learning.get(f"{cell.row.split()[0]} {cell.place} learning")
+        metrics = learning.get(f"{cell.env} {cell.place} learning")
         if cell.agent == "expert" and metrics is not None:
             curves.setdefault(cell.row, []).append((cell, metrics))
     with matplotlib.rc_context(

@@ -10,7 +10,7 @@ from irlcli.labels import duration
 from irlcli.report.agents import title
 from irlcli.report.build import Report
 from irlcli.report.lineage import commits, evaluations, lineage
-from irlcli.report.parameters import Parameters
+from irlcli.report.parameters import Parameters, bank_picture
 from irlcli.report.tables import REWARD_QUALITY, Table, latex_table, markdown_table
 from irlcli.report.text import number
 
@@ -37,7 +37,7 @@ def markdown(p: Parameters, report: Report) -> str:
         parts += [f"## {table.title}\n", markdown_table(table.columns, table.rows)]
         if table.title == REWARD_QUALITY:
             rows = dict.fromkeys(report.reward_quality["row"])
-            parts += [f"![{row}](bank-{row.replace(' ', '-')}.png)\n" for row in rows]
+            parts += [f"![{row}]({bank_picture(row)})\n" for row in rows]
         parts += [table.note + "\n"] if table.note else []
     parts.append("## Files\n")
     parts.append(

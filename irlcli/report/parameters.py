@@ -54,6 +54,16 @@ class Cell(msgspec.Struct, frozen=True):
     retraining: int = 0
 
     @property
+    def env(self) -> str:
+        """The row's environment."""
+        return self.row.split()[0]
+
+    @property
+    def knob(self) -> str:
+        """The row's knob."""
+        return self.row.split()[1]
+
+    @property
     def role(self) -> str:
         """Name of the evaluation among the stage's inputs."""
         seed = "-" if self.seed is None else self.seed
@@ -160,3 +170,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     runs: dict[str, Run]
     libraries: dict[str, dict[str, str | None]]
     others: tuple[Others, ...]
+
+
+def bank_picture(row: str) -> str:
+    """The file name of the bank of ``row``, ``ENV KNOB``."""
+    return f"bank-{row.replace(' ', '-')}.png"

@@ -12,7 +12,7 @@ from irlcli.data.descriptions import Assessment, BankEntry
 from irlcli.report import drawing
 from irlcli.report.agents import title
 from irlcli.report.compute import Assessments
-from irlcli.report.parameters import Parameters
+from irlcli.report.parameters import Parameters, bank_picture
 from irlcli.report.plots import INK, as_svg, style
 
 # Kind of policy to its name in the legend and to Okabe and Ito's colours.
@@ -57,7 +57,7 @@ def draw_banks(directory: Path, p: Parameters, assessments: Assessments) -> dict
         if not lines:
             continue
         with style("black"):
-            _scatter(lines).savefig(directory / f"bank-{row.env}-{row.knob}.png", dpi=_DPI)
+            _scatter(lines).savefig(directory / bank_picture(row.name), dpi=_DPI)
         with style(INK):
             name = f"{row.name}: the bank's policies, bars are standard errors over episodes"
             found[name] = as_svg(_scatter(lines), f"bank{len(found)}")
