@@ -112,7 +112,6 @@ class StageSession(base.StageSession):
         self.as_json = as_json
         self.dry_run = dry_run
         self.tensorboard = tensorboard
-        self._prepared: list[Request] = []
 
     def place_words(self) -> list[str]:
         """The options that make another command use the same stores, waiting and workers."""
@@ -140,7 +139,7 @@ class StageSession(base.StageSession):
         Returns:
             the artefacts; none with ``--dry-run``.
         """
-        self._warn_of_unread([*self._prepared, *requests])
+        self.warn_of_unread(requests)
         if self.dry_run:
             if name is not None:
                 self.store.check_name(name)
@@ -152,28 +151,14 @@ class StageSession(base.StageSession):
             self.print_artefact(artefact, name, details)
         return artefacts
 
-    def _warn_of_unread(self, requests: Sequence["Request"]) -> None:
-        """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold."""
-        if not self.overrides:
-            return
-        from irlcli.requests.overrides import behind, replaced, unread
-
-        every = [made for request in requests for made in behind(request)]
-        for line in replaced(self.overrides, every):
-            self.console.warn(line)
-        stages = {request.stage.name for request in every}
-        # A bank is looked for under the whole config.
-        for item in () if "assess" in stages else unread(self.overrides, stages):
-            self.console.warn(f"no stage of this command reads --set {item}")
-
     def prepare(self, request: "Request") -> Artefact | None:
         """The artefact of ``request``, not printed.
 
         With ``--dry-run`` None if it is missing; the printed plan shows ``train-airl`` as blocked.
         """
-        self._prepared.append(request)
         if not self.dry_run:
             return super().prepare(request)
+        self.prepared.append(request)
         from irlcli.experiments.status import Step
 
         steps = self.runner().plan(request)

@@ -343,6 +343,7 @@ class Lab:
         }
         with self._at_work(configs, words("evaluate", options)) as session:
             requests = evaluation.evaluate(session, **options, name=name)
+            session.warn_of_unread(requests)
             return Evaluations([Stored(session, a) for a in session.run(requests, name)])
 
     @plainly
@@ -433,12 +434,14 @@ class Lab:
     ) -> StageSession:
         """A session for one call, which artefacts record as the command ``line``."""
         settings = configs.get("settings", self.settings)
+        asked = overrides(configs.get("set", ()))
         session = StageSession(
             self.store,
             self._console,
             profile=configs.get("profile", self.profile),
             file=None if settings is None else Path(settings),
-            overrides=merged(self.set, overrides(configs.get("set", ()))),
+            overrides=merged(self.set, asked),
+            asked=asked,
             sources=self.sources,
             command=(),
             wait=self.wait,
@@ -461,6 +464,7 @@ class Lab:
             yield session
 
     def _run(self, session: StageSession, request: Request, name: str | None) -> Stored:
+        session.warn_of_unread([request])
         return Stored(session, session.run([request], name)[0])
 
     def _ref(self, ref: Ref) -> str:

@@ -86,6 +86,7 @@ class StageSession(Session):
 
     Args:
         profile, file, overrides: as for :func:`irlcli.configs.load_config`.
+        asked: those of ``overrides`` that were given for what is run now, all of them by default.
         sources: other stores, directories or URLs, to copy missing artefacts from.
         command: the command line that artefacts record, so that a damaged one shows its repair.
         workers: processes that step environments.
@@ -107,6 +108,7 @@ class StageSession(Session):
         wait: bool = True,
         workers: int = 1,
         read_only: bool = False,
+        asked: Sequence[str] | None = None,
     ):
         from irlcli.configs import check_profile
 
@@ -118,6 +120,9 @@ class StageSession(Session):
         # Settings file of a table, which the session's own file replaces.
         self.table_file: Path | None = None
         self.overrides = list(overrides)
+        self.asked = self.overrides if asked is None else list(asked)
+        # Requests on which those to run depend.
+        self.prepared: list[Request] = []
         self.sources = list(sources)
         self.command = list(command)
         self.workers = workers
@@ -207,7 +212,22 @@ class StageSession(Session):
 
         None if nothing may be run, and it is missing.
         """
+        self.prepared.append(request)
         return self.run([request])[0]
+
+    def warn_of_unread(self, requests: Sequence["Request"]) -> None:
+        """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold."""
+        if not self.asked:
+            return
+        from irlcli.requests.overrides import behind, replaced, unread
+
+        every = [made for request in (*self.prepared, *requests) for made in behind(request)]
+        for line in replaced(self.asked, every):
+            self.console.warn(line)
+        stages = {request.stage.name for request in every}
+        # A bank is looked for under the whole config.
+        for item in () if "assess" in stages else unread(self.asked, stages):
+            self.console.warn(f"no stage of this command reads --set {item}")
 
 
 def _check_repeated(overrides: Sequence[str]) -> None:

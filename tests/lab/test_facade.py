@@ -227,3 +227,12 @@ def test_the_package_is_light_to_import():
     code = f"import sys, irlcli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_field_that_a_call_sets_in_vain_is_named(lab, capsys):
+    lab.evaluate(idle=True, **IDLE, set={"transfer.total_steps": 5})
+    assert "transfer.total_steps=5" in capsys.readouterr().err
+    # One of the lab's may be for other calls.
+    other = irlcli.Lab(lab.store, profile="smoke", set={"transfer.total_steps": 5})
+    other.evaluate(idle=True, **IDLE)
+    assert "transfer.total_steps" not in capsys.readouterr().err
