@@ -65,6 +65,11 @@ class Submission:
         self._waiting: list[Array] = []
         self._arrays: list[Array] = []
         self._record: Record | None = None
+        # Steps whose jobs have not ended; since when they run, and are gone from the queue [s].
+        self._alive: set[str] = set()
+        self._running: dict[str, float] = {}
+        self._gone: dict[str, float] = {}
+        self._started = 0.0
         self._lost: set[str] = set()
         self._explained: set[str] = set()
         self._signals = 0
@@ -113,58 +118,60 @@ class Submission:
         Raises:
             StageFailed: the queue did not answer for ten minutes.
         """
-        alive = set(self._ids)
-        running: dict[str, float] = {}
-        gone: dict[str, float] = {}
-        started = answered = time.monotonic()
+        self._alive = set(self._ids)
+        self._started = answered = time.monotonic()
         with stop_requests(self._stop):
-            while (alive or self._waiting) and not self._stopped:
+            while (self._alive or self._waiting) and not self._stopped:
                 if self._waiting:
-                    alive |= self._start_ready(len(alive))
+                    self._alive |= self._start_ready(len(self._alive))
                 try:
                     states = self._queue.states()
                 except StageFailed:
                     if time.monotonic() - answered > _SILENCE_SECONDS:
                         raise
-                    self._pause(time.monotonic() - started)
-                    continue
-                answered = time.monotonic()
-                self._plan.lookup.forget_missing()
-                for name in [task for task in self._plan.tasks if task in alive]:
-                    state = states.get(self._ids[name])
-                    if state is None:
-                        last = answered - gone.setdefault(name, answered) > self._queue.lag
-                        if self._ended(name, last, since=running.get(name, started)):
-                            alive.remove(name)
+                else:
+                    answered = time.monotonic()
+                    self._poll(states, answered)
+                    if not self._alive:
+                        if not self._any_ready():
+                            break
                         continue
-                    gone.pop(name, None)
-                    if state.startswith("RUNNING"):
-                        if name not in running:
-                            running[name] = time.monotonic()
-                            self._display.start(name)
-                        self._show_progress(name)
-                    else:
-                        self._explain(name, state)
-                if alive:
-                    self._pause(time.monotonic() - started)
-                elif not self._any_ready():
-                    break
+                self._pause(time.monotonic() - self._started)
             if self._stopped and not self._queue.starts_what_waits:
-                self._stop_jobs(alive, running)
+                self._stop_jobs()
         done = {*self._outcome.existed, *self._outcome.copied, *self._outcome.made}
         blocked = [n for n in self._plan.tasks if n not in done and n not in self._outcome.failed]
         return replace(self._outcome, blocked=blocked, interrupted=self._stopped)
 
-    def _stop_jobs(self, alive: set[str], running: Mapping[str, float]) -> None:
+    def _poll(self, states: Mapping[str, str], now: float) -> None:
+        """Show how far the jobs are that have not ended, and note those that have."""
+        self._plan.lookup.forget_missing()
+        for name in [task for task in self._plan.tasks if task in self._alive]:
+            state = states.get(self._ids[name])
+            if state is None:
+                last = now - self._gone.setdefault(name, now) > self._queue.lag
+                if self._ended(name, last):
+                    self._alive.remove(name)
+                continue
+            self._gone.pop(name, None)
+            if state.startswith("RUNNING"):
+                if name not in self._running:
+                    self._running[name] = now
+                    self._display.start(name)
+                self._show_progress(name)
+            else:
+                self._explain(name, state)
+
+    def _stop_jobs(self) -> None:
         """Cancel jobs that nobody else starts again, and wait until they have ended."""
         self._display.stopping("to leave without waiting")
-        ids = {self._ids[name] for name in alive}
+        ids = {self._ids[name] for name in self._alive}
         self._queue.cancel(ids)
         while self._signals < 2 and not ids.isdisjoint(self._queue.states()):
             time.sleep(0.5)
         self._plan.lookup.forget_missing()
-        for name in alive:
-            self._ended(name, last=False, since=running.get(name, time.monotonic()))
+        for name in self._alive:
+            self._ended(name, last=False)
 
     def _find_queued(self, names: Sequence[str]) -> list[str]:
         """Note the jobs of steps that are in the queue; returns the other steps."""
@@ -251,14 +258,18 @@ class Submission:
         self._waiting = [a for a in self._waiting if not self._ids.keys() >= set(a.names)]
         return started
 
-    def _ended(self, name: str, last: bool, since: float) -> bool:
-        """Whether it is clear what became of a step whose job has left the queue."""
+    def _ended(self, name: str, last: bool) -> bool:
+        """Whether it is clear what became of a step whose job has left the queue.
+
+        ``last``: its files have had the time to become visible.
+        """
         step = self._plan.step(name)
         if step.status == "HIT" and step.artefact is not None:
             self._runner.store.set_name(name, step.artefact)
             self._outcome.made.append(name)
             if self._plan.chooses(name):
                 self._plan.refresh()
+            since = self._running.get(name, self._started)
             self._display.done(name, time.monotonic() - since)
             return True
         if not self._lost.isdisjoint(self._plan.needs[name]):
