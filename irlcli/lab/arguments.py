@@ -47,17 +47,17 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
         try:
             return method(*args, **kwargs)
         except IrlError as error:
-            error.message, error.hint = _in_python(error.message), _in_python(error.hint)
+            error.message, error.hint = in_python(error.message), in_python(error.hint)
             raise error.with_traceback(None) from None
         except OSError as error:
             failed = file_failure(error)
-            failed.hint = _in_python(failed.hint)
+            failed.hint = in_python(failed.hint)
             raise failed from None
 
     return call
 
 
-def _in_python(text: str) -> str:
+def in_python(text: str) -> str:
     """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
     text = text.replace("the same command again", "the same call again")
     return re.sub(

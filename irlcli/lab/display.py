@@ -14,14 +14,15 @@ from typing import Any
 
 from irlcli.cli.console import Pace, TerminalConsole, printable
 from irlcli.experiments.runner import Silent
+from irlcli.lab.arguments import in_python
 from irlcli.store import Artefact
 
 _SECONDS_BETWEEN_UPDATES = 0.25
 
 
-def console(quiet: bool) -> NotebookConsole | TerminalConsole:
+def console(quiet: bool) -> NotebookConsole | PlainConsole:
     """What suits the place: a notebook, or else a terminal or a file."""
-    return NotebookConsole(quiet) if _in_notebook() else TerminalConsole(quiet)
+    return NotebookConsole(quiet) if _in_notebook() else PlainConsole(quiet)
 
 
 def _in_notebook() -> bool:
@@ -45,6 +46,14 @@ class _Line:
         if self._share is None:
             return None
         return f'<progress value="{self._share:.4f}"></progress> <code>{escape(self._text)}</code>'
+
+
+class PlainConsole(TerminalConsole):
+    """The command line's console; warnings call options as arguments."""
+
+    def warn(self, message: str) -> None:
+        """Print a warning, also if quiet."""
+        super().warn(in_python(message))
 
 
 class NotebookConsole(Silent):
@@ -87,7 +96,7 @@ class NotebookConsole(Silent):
 
     def warn(self, message: str) -> None:
         """Print a warning, also if quiet."""
-        print(printable(f"warning: {message}"), file=sys.stderr, flush=True)
+        print(printable(f"warning: {in_python(message)}"), file=sys.stderr, flush=True)
 
     def say(self, text: str) -> None:
         """Print a line."""
