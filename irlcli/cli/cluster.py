@@ -235,7 +235,8 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
 
     queue = _queue_of(session, plan, options)
     there = queued(plan, queue, session.store)
-    submissions = records(session.store, queue.place)
+    # Of each step's last job.
+    last = {job.name: r for r in records(session.store, queue.place) for job in r.jobs}
     lines: list[dict[str, str | None]] = []
     exist = 0
     for name in plan.tasks:
@@ -248,9 +249,7 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
             why = f"job {there[name].job} {place}"
             lines.append({"name": name, "state": state, "job": there[name].job, "why": why})
             continue
-        # What the last job of this name said.
-        failures = (r.failure(name) for r in reversed(submissions) if r.has(name))
-        failure = next(failures, None)
+        failure = last[name].failure(name) if name in last else None
         if failure is not None:
             lines.append({"name": name, "state": "FAILED", "job": None, "why": failure.message})
         else:

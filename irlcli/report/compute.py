@@ -185,11 +185,11 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     """A row per row, measure and pair of methods (x, y), over seeds with every evaluation.
 
     Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means; two-sided p-values
-    ``p_welch`` (primary), ``p_welch_holm`` (over the rows, of an ablation over the rows and variants),
-    ``p_paired`` (over the ``pairs`` seeds
-    that both methods have), ``p_student`` and ``p_rank`` (Mann-Whitney); ``improvement``, the
-    probability that a seed of x beats one of y; ``not_imitated``, which of the two failed in
-    distribution; ``why``, the reason for a missing Welch test.
+    ``p_welch`` (primary), ``p_welch_holm`` (over the rows, in an ablation over the rows and
+    variants), ``p_paired`` (over the ``pairs`` seeds that both methods have), ``p_student`` and
+    ``p_rank`` (Mann-Whitney); ``improvement``, the probability that a seed of x beats one of y;
+    ``not_imitated``, which of the two failed in distribution; ``why``, the reason for a missing
+    Welch test.
     """
     pairs = [(v.name, p.variants[0].name) for v in p.variants[1:]] or comparisons(p.methods)
     students = cells[(cells["measure"] == "id") & cells["agent"].isin(p.methods)]

@@ -110,6 +110,19 @@ def test_two_runs_of_one_table_start_each_step_once(plain, runs, tmp_path):
     assert max(runs.computed().values()) == 1
 
 
+def test_a_step_that_was_made_meanwhile_is_not_started(runs, tmp_path):
+    store = tmp_path / "runs"
+    process = runs.start(store, "--cluster", "local", "--until", "experts", IRL_TEST_ROUND="1.5")
+    runs.wait_for(lambda line: "computes" in line, process)
+    started = set(runs.processes())
+    other, *_ = sorted({f"{ROW}.expert.{power}" for power in ("1x", "1.25x", "1.5x")} - started)
+    runs.run(store, "--only", other)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert runs.processes().count(other) == 1 and len(Store(store).ids()) == 3
+    assert f"DONE {other}" in errors
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_submission_keeps_what_others_recorded(runs, tmp_path):
     """The logs and the failures of jobs that have ended, and a record that has no job yet."""

@@ -68,10 +68,6 @@ class Record:
         write_durably(path, json.dumps(value).encode())
         self.jobs += jobs
 
-    def has(self, name: str) -> bool:
-        """Whether a job of the step called ``name`` was submitted."""
-        return any(job.name == name for job in self.jobs)
-
     def failure(self, name: str) -> Failure | None:
         """Why the job of a step failed, if it said so."""
         try:

@@ -225,12 +225,13 @@ class Submission:
             ]
         )
 
+    def _unstarted(self) -> list[str]:
+        """The steps that wait for others, or for a free place."""
+        handled = {*self._ids, *self._outcome.made}
+        return [name for array in self._waiting for name in array.names if name not in handled]
+
     def _any_ready(self) -> bool:
-        return any(
-            name not in self._ids and self._ready(name)
-            for array in self._waiting
-            for name in array.names
-        )
+        return any(map(self._ready, self._unstarted()))
 
     def _ready(self, name: str) -> bool:
         return all(self._exists(need) for need in self._plan.needs[name])
@@ -240,14 +241,18 @@ class Submission:
 
         A step that another submission has started meanwhile is watched instead.
         """
-        waiting = [name for a in self._waiting for name in a.names if name not in self._ids]
-        ready = [name for name in waiting if self._ready(name)]
+        ready = [name for name in self._unstarted() if self._ready(name)]
         started: set[str] = set()
         if ready and running < self._command.at_a_time:
             store = self._runner.store
             with store.working_on(LOCK, wait=True):
                 there = queued(self._plan, self._queue, store)
+                # A step that is no longer in the queue may have been made.
+                self._plan.lookup.forget_missing()
                 for name in ready:
+                    if self._exists(name):
+                        self._ended(name, last=False)
+                        continue
                     if name in there:
                         self._ids[name], self._records[name] = there[name].job, there[name].record
                     elif running + len(started) < self._command.at_a_time:
@@ -255,7 +260,8 @@ class Submission:
                     else:
                         continue
                     started.add(name)
-        self._waiting = [a for a in self._waiting if not self._ids.keys() >= set(a.names)]
+        waiting = {*self._unstarted()}
+        self._waiting = [a for a in self._waiting if not waiting.isdisjoint(a.names)]
         return started
 
     def _ended(self, name: str, last: bool) -> bool:
