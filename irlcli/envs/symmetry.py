@@ -26,8 +26,14 @@ def symmetries(
     """
     place = environment(env).symmetries
     assert place is not None
-    with importing(f"environment {env!r}", place):
-        function = resolve_name(place)
+    module, _, name = place.partition(":")
+    with importing(f"environment {env!r}", module):
+        function = getattr(resolve_name(module), name, None)
+    if function is None:
+        raise StageFailed(
+            f"{module} has no function {name!r}",
+            f"define {name}(settings), or declare no symmetries",
+        )
     arguments = [env_kwargs(env, setting) for setting in settings]
     try:
         found: Any = function(arguments)

@@ -123,10 +123,12 @@ def _check_names(tables: Iterable[Table]) -> None:
             for name, config in changed.items():
                 other, same = first.setdefault((row, name), (table.name, config))
                 if same != config:
+                    what = "other overrides" if table.variants else "another lambda"
                     raise UsageError(
-                        f"{other} and {table.name} both have {name} in {row}, under the same names "
-                        "with another config",
-                        f"give {table.name} settings of its own, or rename the variant",
+                        f"{table.name!r} has {name} in {row} with {what} than {other!r}, so different "
+                        "results would have one name",
+                        f"write settings = FILE in [{table.name}], or "
+                        + ("rename the variant" if table.variants else "omit penalty_weights"),
                     )
 
 

@@ -32,9 +32,15 @@ class Configs(TypedDict, total=False):
     set: Overrides
 
 
+# Annotations of arguments that are text.
+_TEXT = ("str", "str | None")
+
+
 def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
     """``method`` with errors that name arguments instead of options, and show no inner frames."""
-    known = {*inspect.signature(method).parameters} - {"self"}
+    signature = inspect.signature(method)
+    known = {*signature.parameters} - {"self"}
+    texts = [p.name for p in signature.parameters.values() if p.annotation in _TEXT]
     if "configs" in known:
         known = {*known, *Configs.__annotations__} - {"configs"}
     shown = method.__qualname__.removesuffix(".__init__").rpartition(".")[2]
@@ -44,6 +50,10 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
         # ``**configs`` would take any name.
         for name in kwargs.keys() - known:
             raise UsageError(f"{shown} has no argument {name!r}", suggest(name, known))
+        given = signature.bind_partial(*args, **kwargs).arguments
+        for name in texts:
+            if not isinstance(value := given.get(name, ""), str | None):
+                raise UsageError(f"{name} {value!r} is not text", f'write {name}="{value}"')
         try:
             return method(*args, **kwargs)
         except IrlError as error:

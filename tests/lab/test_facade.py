@@ -161,6 +161,8 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
         (lambda lab: lab.transfer("airl", "1.5x", setting="bounce=0.1"), UsageError, "give one of"),
         (lambda lab: lab.train_airl("demos", "imr"), UsageError, "hint: did you mean 'irm'"),
         (lambda lab: lab.train_airl("demos", metod="irm"), UsageError, "did you mean 'method'"),
+        (lambda lab: lab.train_airl("demos", penalty=10), UsageError, "penalty 10 is not text"),
+        (lambda lab: lab.train_airl("demos", 3), UsageError, "method 3 is not text"),
         (lambda lab: lab.train_airl("nothing"), NotFound, "nothing"),
         (lambda lab: irlcli.Lab("s", storee=1), UsageError, "Lab has no argument 'storee'"),
         (lambda lab: lab.artefact("airl", profile="smoke"), UsageError, "no argument 'profile'"),
