@@ -45,6 +45,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from benchmarks.peers.absorbing import AbsorbingState
 from benchmarks.peers.checks import Checks, Ended
 from irlcli.envs.registration import build
 from irlcli.envs.registry import environment
@@ -140,7 +141,7 @@ def _train_student(run: dict[str, Any], checks: Checks) -> None:
         environment(run["row"].split(".")[0]).max_episode_steps if kind != ["variable"] else None
     )
     count, discriminator, generator = _values(name, run["row"].split(".")[0], bool(kind))
-    worlds = _worlds(run, count, fixed)
+    worlds = _worlds(run, count, fixed is not None)
     reward = network(
         worlds.observation_space, worlds.action_space, normalize_input_layer=RunningNorm
     )
@@ -191,17 +192,16 @@ def _values(name: str, env: str, best: bool) -> tuple[int, dict[str, Any], dict[
     return 8, discriminator, {"policy": FeedForward32Policy, "n_steps": steps // 8, **generator}
 
 
-def _worlds(run: dict[str, Any], count: int, fixed: int | None = None) -> DummyVecEnv:
-    """``count`` worlds in equal shares of each setting, of ``fixed`` length where that must be said."""
+def _worlds(run: dict[str, Any], count: int, fixed: bool = False) -> DummyVecEnv:
+    """``count`` worlds in equal shares of each setting; ``fixed``: whether no episode ends early."""
     env = run["row"].split(".")[0]
     spec = environment(env)
     settings = [parse_setting(env, text) for text in run["settings"]]
-    horizon = {"fixed_horizon": fixed} if fixed and env == "lunar-lander" else {}
 
     def make(index: int) -> TimeLimit:
         setting = settings[index * len(settings) // count]
-        world = build(spec, env_kwargs(env, setting) | horizon, str(setting))
-        return TimeLimit(world, spec.max_episode_steps)
+        world = build(spec, env_kwargs(env, setting), str(setting))
+        return TimeLimit(AbsorbingState(world) if fixed else world, spec.max_episode_steps)
 
     venv = DummyVecEnv([lambda i=i: make(i) for i in range(count)])
     venv.seed(run["seed"])

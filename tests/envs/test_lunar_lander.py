@@ -24,9 +24,7 @@ def run(env, seed, actions):
     return np.array(observations), np.array(rewards)
 
 
-@pytest.mark.parametrize(
-    "kwargs", [{}, {"bounce": 0.5, "friction": 0.4, "engine_power": 1.25}, {"fixed_horizon": 50}]
-)
+@pytest.mark.parametrize("kwargs", [{}, {"bounce": 0.5, "friction": 0.4, "engine_power": 1.25}])
 def test_passes_gymnasiums_checker(kwargs):
     check_env(gymnasium.make("irlcli/LunarLander-v0", **kwargs).unwrapped, skip_render_check=True)
 
@@ -130,20 +128,6 @@ def test_instances_do_not_affect_each_other():
                 assert reward == rewards[t]
 
 
-def test_fixed_horizon_turns_termination_into_an_absorbing_state():
-    actions = [0] * 300
-    free, rewards = run(LunarLander(), 1, actions)
-    env = LunarLander(fixed_horizon=250)
-    env.reset(seed=1)
-    for t in range(250):
-        observation, reward, terminated, truncated, _ = env.step(3 if t > len(rewards) else 0)
-        assert not terminated
-        assert truncated == (t == 249)
-        assert reward == (rewards[t] if t < len(rewards) else 0.0)
-        np.testing.assert_array_equal(observation, free[min(t + 1, len(rewards))])
-    assert len(rewards) < 250
-
-
 @pytest.mark.parametrize(
     "kwargs",
     [
@@ -154,7 +138,6 @@ def test_fixed_horizon_turns_termination_into_an_absorbing_state():
         {"friction": float("inf")},
         {"engine_power": 0.0},
         {"engine_power": float("nan")},
-        {"fixed_horizon": 0},
     ],
 )
 def test_values_out_of_range_are_rejected_by_name(kwargs):

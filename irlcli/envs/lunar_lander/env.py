@@ -40,10 +40,6 @@ class LunarLander(original.LunarLander):
         friction: friction coefficient of the moon, at least 0 (original: 0.1). Between two
             touching bodies, Box2D uses sqrt(f1 * f2).
         engine_power: multiplier of the main engine's impulse, above 0 (original: 1).
-        fixed_horizon: if a number H, every episode is truncated after exactly H steps. A state
-            that would terminate becomes absorbing: its observation is repeated, actions have no
-            effect, and the reward is 0. Not what ``airl.fixed_horizon`` switches on, which pays
-            such states the learned reward in closed form.
         render_mode: ``None``, ``"human"`` or ``"rgb_array"``.
 
     Raises:
@@ -55,7 +51,6 @@ class LunarLander(original.LunarLander):
         bounce: float = 0.0,
         friction: float = 0.1,
         engine_power: float = 1.0,
-        fixed_horizon: int | None = None,
         render_mode: str | None = None,
     ):
         if not 0.0 <= bounce <= 1.0:
@@ -64,25 +59,19 @@ class LunarLander(original.LunarLander):
             raise ValueError(f"friction must be at least 0 and finite, not {friction}")
         if not (np.isfinite(engine_power) and engine_power > 0.0):
             raise ValueError(f"engine_power must be above 0 and finite, not {engine_power}")
-        if fixed_horizon is not None and fixed_horizon < 1:
-            raise ValueError(f"fixed_horizon must be at least 1, not {fixed_horizon}")
         super().__init__(render_mode=render_mode)
-        EzPickle.__init__(self, bounce, friction, engine_power, fixed_horizon, render_mode)
+        EzPickle.__init__(self, bounce, friction, engine_power, render_mode)
         self.bounce = bounce
         self.friction = friction
         self.engine_power = engine_power
-        self.fixed_horizon = fixed_horizon
         self._original_step = _bind(
             original.LunarLander.step, MAIN_ENGINE_POWER=original.MAIN_ENGINE_POWER * engine_power
         )
-        self._steps = 0
-        self._absorbed: np.ndarray | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode, and return the observation [8] float32 and an info."""
-        self._absorbed = None
         observation, info = super().reset(seed=seed, options=options)
         # A contact keeps the coefficients it was created with. The lander starts high above the
         # ground, so no contact exists yet.
@@ -92,7 +81,6 @@ class LunarLander(original.LunarLander):
         assert self.moon is not None
         for fixture in self.moon.fixtures:
             fixture.friction = self.friction
-        self._steps = 0
         return observation, info
 
     def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -100,13 +88,4 @@ class LunarLander(original.LunarLander):
 
         Returns the observation [8] float32, the true reward, terminated, truncated and an info.
         """
-        if self.fixed_horizon is None:
-            return self._original_step(self, action)
-        if self._absorbed is None:
-            observation, reward, terminated, _, info = self._original_step(self, action)
-            if terminated:
-                self._absorbed = observation
-        else:
-            observation, reward, info = self._absorbed.copy(), 0.0, {}
-        self._steps += 1
-        return observation, reward, False, self._steps >= self.fixed_horizon, info
+        return self._original_step(self, action)
