@@ -88,16 +88,18 @@ def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> 
 
 
 def print_report(session: StageSession, artefact: Artefact) -> None:
-    """The tables and caveats of a report on stderr."""
+    """The tables and caveats of a report on stderr, with the note of the first table only."""
     _warn_of_versions(session, artefact)
     report = report_json(session, artefact)
     if report is None:
         out.print_note(session.store.open(artefact, "README.md").read_text().rstrip())
         return
-    for table in report["tables"]:
-        if table["title"] != EVERY_CELL:
-            out.print_table(table["columns"], table["rows"], table["title"], stderr=True)
-            out.print_note(f"{table['note']}\n" if table["note"] else "")
+    shown = [table for table in report["tables"] if table["title"] != EVERY_CELL]
+    for table in shown:
+        out.print_table(table["columns"], table["rows"], table["title"], stderr=True)
+        out.print_note(f"{table['note']}\n" if table is shown[0] else "")
+    if any(table["note"] for table in shown[1:]):
+        out.print_note("The report's README.md explains the columns of the other tables.\n")
     for caveat in report["caveats"]:
         out.print_note(f"- {caveat}")
 

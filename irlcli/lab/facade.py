@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Unpack
 
+from irlcli.configs.load import overridden
 from irlcli.envs import registry
 from irlcli.lab.arguments import (
     Configs,
@@ -53,7 +54,7 @@ class Lab:
         quiet: show warnings only.
 
     Raises:
-        UsageError: an unknown profile. Every method raises :class:`irlcli.errors.IrlError`: its
+        UsageError: an unknown profile or field. Every method raises :class:`irlcli.errors.IrlError`: its
             subclasses stand for the command line's exit codes.
     """
 
@@ -74,6 +75,7 @@ class Lab:
         self.profile = profile
         self.settings = settings
         self.set = overrides(set)
+        overridden(self.set)
         self.sources = [str(source) for source in listed(from_)]
         self.workers = whole("workers", workers, 1)
         self.wait = wait

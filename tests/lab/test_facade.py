@@ -164,6 +164,7 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
         (lambda lab: lab.train_airl("demos", penalty=10), UsageError, "penalty 10 is not text"),
         (lambda lab: lab.train_airl("demos", 3), UsageError, "method 3 is not text"),
         (lambda lab: lab.train_airl("nothing"), NotFound, "nothing"),
+        (lambda lab: irlcli.Lab("s", set={"airl.foo": 1}), UsageError, "airl.foo"),
         (lambda lab: irlcli.Lab("s", storee=1), UsageError, "Lab has no argument 'storee'"),
         (lambda lab: lab.artefact("airl", profile="smoke"), UsageError, "no argument 'profile'"),
         (lambda lab: lab.evaluate(idle=True, **{**IDLE, "seed": -1}), UsageError, "seed=0 or more"),
