@@ -110,6 +110,22 @@ def test_two_runs_of_one_table_start_each_step_once(plain, runs, tmp_path):
     assert max(runs.computed().values()) == 1
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_ctrl_c_leaves_the_jobs_of_another_run(plain, runs, tmp_path):
+    store = tmp_path / "runs"
+    line = (store, "--cluster", "local", "--jobs", "3", "--until", "experts")
+    first = runs.start(*line, IRL_TEST_ROUND="1.5")
+    runs.wait_for(lambda line: "computes" in line, first)
+    second = runs.start(*line)
+    while not second.stderr.readline().startswith("RUN "):
+        assert second.poll() is None
+    os.killpg(second.pid, signal.SIGINT)
+    assert "stopped: " in second.communicate(timeout=200)[1] and second.returncode == 130
+    _, errors = first.communicate(timeout=200)
+    assert first.returncode == 0, errors
+    assert max(runs.computed().values()) == 1
+
+
 def test_a_step_that_was_made_meanwhile_is_not_started(runs, tmp_path):
     store = tmp_path / "runs"
     process = runs.start(store, "--cluster", "local", "--until", "experts", IRL_TEST_ROUND="1.5")

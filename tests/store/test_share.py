@@ -11,6 +11,7 @@ import pytest
 from every_step import counter, in_child, intercept, kill_self
 from places import at, files_of, memory, other, pull, push
 
+from irlcli.cli.options import sources_of_environment
 from irlcli.experiments.status import Lookup
 from irlcli.stages.base import Request, Stage
 from irlcli.store import Store
@@ -63,17 +64,16 @@ def test_what_a_url_has_is_not_computed_again(irl, smoke_store, bucket, tmp_path
 
 
 def test_directories_and_urls_in_the_environment(monkeypatch):
-    from irlcli.cli.options import _places
-
-    text = "zoo:/data/runs:s3://bucket/lab:https://host:8080/a/b:zoo 2"
-    assert _places(text) == [
+    monkeypatch.setenv("IRL_FROM", "zoo:/data/runs:s3://bucket/lab:https://host:8080/a/b:zoo 2")
+    assert sources_of_environment() == [
         "zoo",
         "/data/runs",
         "s3://bucket/lab",
         "https://host:8080/a/b",
         "zoo 2",
     ]
-    assert _places("") == []
+    monkeypatch.setenv("IRL_FROM", "")
+    assert sources_of_environment() == []
 
 
 @pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)

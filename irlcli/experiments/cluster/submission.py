@@ -163,14 +163,15 @@ class Submission:
                 self._explain(name, state)
 
     def _stop_jobs(self) -> None:
-        """Cancel jobs that nobody else starts again, and wait until they have ended."""
+        """Cancel the jobs that this run started, and wait until they have ended."""
         self._display.stopping("to leave without waiting")
-        ids = {self._ids[name] for name in self._alive}
+        own = [name for name in self._alive if self._records[name] is self._record]
+        ids = {self._ids[name] for name in own}
         self._queue.cancel(ids)
         while self._signals < 2 and not ids.isdisjoint(self._queue.states()):
             time.sleep(0.5)
         self._plan.lookup.forget_missing()
-        for name in self._alive:
+        for name in own:
             self._ended(name, last=False)
 
     def _find_queued(self, names: Sequence[str]) -> list[str]:
