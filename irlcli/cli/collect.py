@@ -4,8 +4,7 @@ from typing import Annotated
 
 import typer
 
-from irlcli.cli import complete
-from irlcli.cli.options import Name, OneSetting, stage_command
+from irlcli.cli.options import Name, OneSetting, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests import collect as requested
 
@@ -13,13 +12,7 @@ from irlcli.requests import collect as requested
 @stage_command
 def collect_experts(
     session: StageSession,
-    env: Annotated[
-        str,
-        typer.Option(
-            help="Environment, e.g. lunar-lander, or a TOML file that describes one.",
-            autocompletion=complete.environments,
-        ),
-    ],
+    env: RequiredEnv,
     intervention: Annotated[
         str | None,
         typer.Option(help="KNOB=VALUE,VALUE, or KNOB for its ID values in the settings file."),

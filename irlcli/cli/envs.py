@@ -55,6 +55,7 @@ def envs(
         _list(session)
         return
     spec = resolve(env)
+    # A mistake in the settings of any profile is named here.
     configs = {profile: load_config(spec.name, profile) for profile in PROFILES}
     if action == "show":
         _show(session, spec, configs["standard"])

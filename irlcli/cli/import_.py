@@ -4,8 +4,7 @@ from typing import Annotated
 
 import typer
 
-from irlcli.cli import complete
-from irlcli.cli.options import Name, OneSetting, stage_command
+from irlcli.cli.options import Name, OneSetting, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests.collect import import_demonstrations
 
@@ -21,13 +20,7 @@ def import_(
             "all settings, or one per setting.",
         ),
     ],
-    env: Annotated[
-        str,
-        typer.Option(
-            help="Environment, e.g. lunar-lander, or a TOML file that describes one.",
-            autocompletion=complete.environments,
-        ),
-    ],
+    env: RequiredEnv,
     intervention: Annotated[
         str | None,
         typer.Option(

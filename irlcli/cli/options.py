@@ -18,13 +18,12 @@ from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of everything random.")]
 Name = Annotated[str | None, typer.Option(help="Name to give the artefact.")]
-Env = Annotated[
-    str | None,
-    typer.Option(
-        help="Environment, e.g. lunar-lander, or a TOML file that describes one.",
-        autocompletion=complete.environments,
-    ),
-]
+_ENV = typer.Option(
+    help="Environment, e.g. lunar-lander, or a TOML file that describes one.",
+    autocompletion=complete.environments,
+)
+Env = Annotated[str | None, _ENV]
+RequiredEnv = Annotated[str, _ENV]
 OneSetting = Annotated[
     list[str],
     typer.Option(

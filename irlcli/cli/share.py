@@ -27,7 +27,8 @@ _Quiet = Annotated[bool, typer.Option("--quiet", help="No progress on stderr.")]
 def push(
     session: Session,
     refs: _Refs = None,
-    to: Annotated[str, typer.Option("--to", help="Store: a directory or a URL.")] = "",
+    *,
+    to: Annotated[str, typer.Option("--to", help="Store: a directory or a URL.")],
     everything: _All = False,
     quiet: _Quiet = False,
 ) -> None:
@@ -38,7 +39,7 @@ def push(
     from irlcli.store.sources import open_place
 
     session.check_exists()
-    place = open_place(_given(to, "--to"), session.console.warn)
+    place = open_place(to, session.console.warn)
     artefacts = _chosen(session.store, session.artefact, refs, everything)
     _share(session, session.store, place, artefacts, f"push to {place.root}", quiet)
 
@@ -47,7 +48,8 @@ def push(
 def pull(
     session: Session,
     refs: _Refs = None,
-    source: Annotated[str, typer.Option("--from", help="Store: a directory or a URL.")] = "",
+    *,
+    source: Annotated[str, typer.Option("--from", help="Store: a directory or a URL.")],
     everything: _All = False,
     quiet: _Quiet = False,
 ) -> None:
@@ -57,7 +59,7 @@ def pull(
     """
     from irlcli.store.sources import open_sources
 
-    (place,) = open_sources([_given(source, "--from")], session.console.warn)
+    (place,) = open_sources([source], session.console.warn)
 
     def there(ref: str) -> Artefact:
         artefact = place.resolve(ref).artefact
@@ -78,14 +80,6 @@ def pull(
         error.hint = _damaged_there(place)
         raise
     _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet)
-
-
-def _given(place: str, option: str) -> str:
-    if not place:
-        raise UsageError(
-            f"{option} is missing", f"name a directory or a URL: {option} s3://BUCKET/PATH"
-        )
-    return place
 
 
 def _chosen(

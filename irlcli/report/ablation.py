@@ -172,7 +172,7 @@ def without_effect(p: Parameters) -> list[str]:
     for row in p.rows:
         runs: dict[frozenset[tuple[str, str, int | None]], list[str]] = {}
         for variant in p.variants:
-            cells = [c for c in p.cells if (c.row, c.agent) == (row.name, variant.name)]
+            cells = p.cells_of(row.name, variant.name)
             if cells and all(c.run for c in cells):
                 runs.setdefault(frozenset((c.run, c.place, c.seed) for c in cells), []).append(
                     variant.name

@@ -24,7 +24,7 @@ def missing(p: Parameters) -> list[str]:
     """A caveat per row: which evaluations are missing, and what they wait for."""
     found = []
     for row in p.rows:
-        cells = [c for c in p.cells if c.row == row.name]
+        cells = p.cells_of(row.name)
         reasons: dict[str, dict[str, dict[str, None]]] = {}
         for c in cells:
             if not c.run:
@@ -160,7 +160,7 @@ def shared_demonstrations(p: Parameters) -> list[str]:
     """Rows in which several seeds learn from one set of demonstrations."""
     rows = []
     for row in p.rows:
-        cells = [c for c in p.cells if c.row == row.name and c.seed is not None and c.run]
+        cells = [c for c in p.cells_of(row.name) if c.seed is not None and c.run]
         seeds = {c.seed for c in cells}
         behind = lineage(p, evaluations(cells))
         sets = [i for i in behind if p.runs[i].stage in ("collect-experts", "import")]
@@ -188,7 +188,7 @@ def mixed(p: Parameters) -> list[str]:
     """Rows whose runs differ in code or library versions."""
     found = []
     for row in p.rows:
-        made = origins(p, evaluations(c for c in p.cells if c.row == row.name))
+        made = origins(p, evaluations(p.cells_of(row.name)))
         if is_mixed(made):
             parts = [
                 f"commit {_attempts(origin.code)}, libraries {origin.libraries}: {_runs(len(ids))}"

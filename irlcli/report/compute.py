@@ -61,9 +61,7 @@ def whole_sample(
 
     A mean over some of the settings cannot be compared with one over all of them.
     """
-    lacking = [
-        c.seed for c in p.cells if (c.row, c.agent, c.measure, c.run) == (row, agent, measure, "")
-    ]
+    lacking = [c.seed for c in p.cells_of(row, agent, measure) if not c.run]
     return sample(points, row, agent, measure).drop(lacking, errors="ignore")
 
 
@@ -135,9 +133,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             progress = values["progress"].mean() if len(values) else math.nan
             # Baselines have one sample and no seed.
             sampled = {None, *values.index}
-            planned = [
-                c for c in p.cells if (c.row, c.agent, c.measure) == (row.name, agent, measure)
-            ]
+            planned = p.cells_of(row.name, agent, measure)
             found.append(
                 {
                     "row": row.name,

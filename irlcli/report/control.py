@@ -10,6 +10,7 @@ import pandas as pd
 
 from irlcli.configs import ControlConfig
 from irlcli.report.drawing import panels, save
+from irlcli.report.means import interval_text, means
 from irlcli.report.statistics import bootstrap_interval
 from irlcli.report.tables import markdown_table
 
@@ -35,22 +36,13 @@ def summary(labels: pd.DataFrame, maps: pd.DataFrame) -> pd.DataFrame:
     ``labels`` has a row per problem, method and seed; ``maps`` per case, variant, seed and setting
     left out.
     """
-    of_labels = labels.rename(columns={"problem": "case", "method": "variant"})
-    whole = maps[maps["left_out"] < 0]
-    rows = []
-    for frame, measures in ((of_labels, ACCURACIES), (whole, MEASURES)):
-        for (case, variant), group in frame.groupby(["case", "variant"], sort=False):
-            for measure in measures:
-                sample = group[measure].to_numpy()
-                low, high = bootstrap_interval(sample)
-                rows.append(
-                    {
-                        **{"case": case, "method": variant, "measure": measure},
-                        **{"mean": float(sample.mean()), "low": low, "high": high},
-                        "seeds": len(sample),
-                    }
-                )
-    return pd.DataFrame(rows)
+    of_labels = labels.rename(columns={"problem": "case"})
+    whole = maps[maps["left_out"] < 0].rename(columns={"variant": "method"})
+    parts = [
+        means(frame, ["case", "method"], measures)
+        for frame, measures in ((of_labels, ACCURACIES), (whole, MEASURES))
+    ]
+    return pd.concat(parts, ignore_index=True).rename(columns={"n": "seeds"})
 
 
 def choices(maps: pd.DataFrame) -> pd.DataFrame:
@@ -147,7 +139,7 @@ class _Cells:
         self._cells = summarised.set_index(["case", "method", "measure"])
 
     def cases(self, prefix: str) -> list[str]:
-        return [case for case in self._frame["case"].unique() if case.startswith(prefix)]
+        return _cases(self._frame, prefix)
 
     def methods(self, case: str) -> list[str]:
         return list(self._frame[self._frame["case"] == case]["method"].unique())
@@ -161,12 +153,6 @@ class _Cells:
             [method, *(self.text(case, method, measure, digits) for measure in measures)]
             for method in self.methods(case)
         ]
-
-
-def interval_text(mean: float, low: float, high: float, digits: int) -> str:
-    """``mean [low, high]``, without a minus sign before zero."""
-    rounded = (round(x, digits) + 0.0 for x in (mean, low, high))
-    return "{:.{d}f} [{:.{d}f}, {:.{d}f}]".format(*rounded, d=digits)
 
 
 def _percents(shares: Sequence[float]) -> str:

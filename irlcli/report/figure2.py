@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from irlcli.report.drawing import save
-from irlcli.report.statistics import bootstrap_interval
+from irlcli.report.means import interval_text, means
 from irlcli.report.tables import markdown_table
 
 MEASURES = (
@@ -44,24 +44,8 @@ def summary(quality: pd.DataFrame) -> pd.DataFrame:
     worst = worst.groupby(["variant", "seed"], sort=False)[list(MEASURES)].min().reset_index()
     worst["value_difference"] *= -1.0
     both = pd.concat([filled, worst.assign(setting="worst", seen=True)])
-    rows = []
-    for (variant, setting), group in both.groupby(["variant", "setting"], sort=False):
-        for measure in MEASURES:
-            sample = group[measure].to_numpy()
-            low, high = bootstrap_interval(sample)
-            rows.append(
-                {
-                    "variant": variant,
-                    "setting": setting,
-                    "seen": bool(group["seen"].iloc[0]),
-                    "measure": measure,
-                    "mean": float(sample.mean()),
-                    "low": low,
-                    "high": high,
-                    "datasets": len(sample),
-                }
-            )
-    return pd.DataFrame(rows)
+    found = means(both, ["variant", "setting", "seen"], MEASURES)
+    return found.rename(columns={"n": "datasets"})
 
 
 def table(summarised: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[list[str]]]:
@@ -78,7 +62,7 @@ def table(summarised: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], l
         row = [variant]
         for _, measure, setting, digits in wanted:
             c = cells.loc[(variant, measure, setting)]
-            row.append(f"{c['mean']:.{digits}f} [{c['low']:.{digits}f}, {c['high']:.{digits}f}]")
+            row.append(interval_text(c["mean"], c["low"], c["high"], digits))
         rows.append(row)
     return ["method", *(w[0] for w in wanted)], rows
 

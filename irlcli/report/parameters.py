@@ -171,6 +171,16 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     libraries: dict[str, dict[str, str | None]]
     others: tuple[Others, ...]
 
+    def cells_of(
+        self, row: str, agent: str | None = None, measure: str | None = None
+    ) -> list[Cell]:
+        """The cells of a row, or of one of its agents, or of one measure of that agent."""
+        return [
+            c
+            for c in self.cells
+            if c.row == row and agent in (None, c.agent) and measure in (None, c.measure)
+        ]
+
 
 def bank_picture(row: str) -> str:
     """The file name of the bank of ``row``, ``ENV KNOB``."""

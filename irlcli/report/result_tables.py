@@ -382,7 +382,7 @@ def costs(p: Parameters) -> Table:
     lines = []
     for row in p.rows:
         stages: dict[str, list[Run]] = {}
-        for id16 in lineage(p, evaluations(c for c in p.cells if c.row == row.name)):
+        for id16 in lineage(p, evaluations(p.cells_of(row.name))):
             stages.setdefault(p.runs[id16].stage, []).append(p.runs[id16])
         for stage, runs in sorted(stages.items()):
             seconds = [r.seconds for r in runs if r.seconds is not None]

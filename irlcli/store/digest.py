@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-_CHUNK = 1 << 20
 _DIGITS = frozenset("0123456789abcdef")
 
 
@@ -55,13 +54,10 @@ def is_hexadecimal(text: str) -> bool:
 
 
 def file_digest(path: Path | str) -> str:
-    """sha256 of a file's bytes, read in chunks.
+    """sha256 of a file's bytes.
 
     Raises:
         OSError: the file cannot be read.
     """
-    hasher = hashlib.sha256()
     with open(path, "rb") as file:
-        while chunk := file.read(_CHUNK):
-            hasher.update(chunk)
-    return hasher.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()

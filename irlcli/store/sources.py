@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from irlcli.errors import NewerFormat, NotFound
+from irlcli.errors import NewerFormat, NotFound, UsageError
 from irlcli.store.artefact import Artefact
 from irlcli.store.store import Store
 
@@ -29,10 +29,14 @@ def open_place(place: Path | str, warn: Callable[[str], None], read_only: bool =
 
     Raises:
         IntegrityError: a newer store, or a damaged one.
-        UsageError: a path is not a directory, or a URL cannot be used.
+        UsageError: an empty text, a path that is no directory, or a URL that cannot be used.
         StageFailed: a URL cannot be reached.
     """
     text = str(place)
+    if not text:
+        raise UsageError(
+            "the name of a store is empty", "name a directory or a URL: s3://BUCKET/PATH"
+        )
     if text.startswith("file://"):
         text = text.removeprefix("file://")
     elif "://" in text:

@@ -2,7 +2,8 @@
 
 import pandas as pd
 
-from irlcli.report.control import MEASURES, choices, interval_text, summary
+from irlcli.report.control import MEASURES, choices, summary
+from irlcli.report.means import interval_text
 
 
 def maps(rows):

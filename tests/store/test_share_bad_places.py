@@ -157,7 +157,6 @@ def test_only_outputs_are_taken(store, chain, url, tmp_path):
         ("nope://bucket/x", 2, "'nope' is unknown"),
         ("memory://nothing-here", 3, "is not a store"),
         ("zoo-of-nobody", 3, "is not a store"),
-        ("", 2, "--from"),
     ],
 )
 def test_a_place_that_is_no_store(irl, tmp_path, place, code, words):
@@ -226,6 +225,16 @@ def test_an_unknown_reference_names_the_place(irl, store, chain, url, tmp_path):
 
 
 # What the command line names
+
+
+@pytest.mark.parametrize("line", [["push", "irm-0", "--to"], ["pull", "irm-0", "--from"]])
+def test_a_place_without_a_name_is_refused(irl, store, chain, line, tmp_path, monkeypatch):
+    """An unset variable of the shell, say. The current directory is not meant."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    result = irl(*line, "", "--store", store.root)
+    assert result.code == 2 and "empty" in result.err and not any(Path().iterdir())
+    assert irl(*line[:-1], "--store", store.root).code == 2
 
 
 def test_a_file_is_no_artefact_to_push_or_pull(irl, store, chain, tmp_path):
