@@ -1,4 +1,4 @@
-"""Symmetries of an environment: images of a transition that are as possible, and as good, as itself."""
+"""Symmetries: maps under which a transition stays equally probable and equally good."""
 
 from typing import NamedTuple
 

@@ -16,7 +16,7 @@ from irlcli.cli.options import planning_command, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
-from irlcli.requests.tables import Choice, check_tag, open_plan, steps_of
+from irlcli.requests.tables import TableChoice, check_tag, open_plan, steps_of
 
 if TYPE_CHECKING:
     from irlcli.experiments.execute import Outcome
@@ -85,7 +85,7 @@ def plan(
         raise UsageError(f"unknown --to {to!r}", "the only engine is snakemake")
     if to is not None and session.as_json:
         raise UsageError("--to prints no JSON", "omit --json or --to")
-    choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
+    choice = TableChoice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     plan = open_plan(session, choice)
     check_tag(session, choice)
     if to is None:
@@ -99,7 +99,7 @@ def plan(
     out.print_data(snakefile(needs, lambda name: ["irl", *command(name)], line).rstrip())
 
 
-def _print_plan(session: StageSession, choice: Choice, plan: "Plan") -> None:
+def _print_plan(session: StageSession, choice: TableChoice, plan: "Plan") -> None:
     steps, counts = steps_of(plan), plan.counts()
     if session.as_json:
         command = _child_words(session, choice, plan)
@@ -200,7 +200,7 @@ def run(
     after a failure or an interruption: finished steps are kept, interrupted ones resume. With
     --cluster each step is a job; --status and --cancel apply to the jobs of this table.
     """
-    choice = Choice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
+    choice = TableChoice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     options = ClusterOptions(
         cluster, partition, time, cpus, array_parallelism, sbatch, requeues, jobs
     )
@@ -246,7 +246,7 @@ def run(
 
 def _check_options(
     session: StageSession,
-    choice: Choice,
+    choice: TableChoice,
     directory: Path | None,
     options: ClusterOptions,
     about_jobs: Literal["status", "cancel"] | None,
@@ -292,7 +292,7 @@ def _make_one(session: StageSession, runner: "Runner", plan: "Plan", only: str) 
 
 
 def _make_all(
-    session: StageSession, runner: "Runner", plan: "Plan", choice: Choice, jobs: int
+    session: StageSession, runner: "Runner", plan: "Plan", choice: TableChoice, jobs: int
 ) -> "Outcome":
     from irlcli.cli.jobs import job_display
     from irlcli.experiments.execute import Execution
@@ -309,7 +309,9 @@ def _make_all(
         display.close()
 
 
-def _child_words(session: StageSession, choice: Choice, plan: "Plan") -> Callable[[str], list[str]]:
+def _child_words(
+    session: StageSession, choice: TableChoice, plan: "Plan"
+) -> Callable[[str], list[str]]:
     """The command line that makes one step, by its name."""
     words = [*session.config_words(), *choice.words(), "--tag", plan.selection.tag]
     words += session.place_words()
@@ -324,7 +326,7 @@ def _report(
     session: StageSession,
     runner: "Runner",
     plan: "Plan",
-    choice: Choice,
+    choice: TableChoice,
     directory: Path | None,
     outcome: "Outcome",
 ) -> None:

@@ -27,7 +27,7 @@ from irlcli.cli.table_report import (
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.requests.session import DEFAULT_PROFILE
-from irlcli.requests.tables import Choice, open_plan
+from irlcli.requests.tables import TableChoice, open_plan
 from irlcli.store import Artefact
 
 _FORMS = ("text", "markdown", "latex")
@@ -93,7 +93,7 @@ def report(
             _refuse(kind, options | _of_stages(session), "--format", "--profile", "--settings")
             _table2(session, form)
         case _:
-            chosen = Choice(kind, seeds, methods, rows, choose_penalty, file=file)
+            chosen = TableChoice(kind, seeds, methods, rows, choose_penalty, file=file)
             if form is not None:
                 raise UsageError(f"{kind} takes no --format", "omit --format")
             _table(session, chosen, name, directory)
@@ -120,7 +120,9 @@ def _refuse(kind: str, options: Mapping[str, Any], *allowed: str) -> None:
             raise UsageError(f"{kind} takes no {option}", taken)
 
 
-def _table(session: StageSession, chosen: Choice, name: str | None, directory: Path | None) -> None:
+def _table(
+    session: StageSession, chosen: TableChoice, name: str | None, directory: Path | None
+) -> None:
     """The report on a table of ``settings/experiments.toml``, from what exists."""
     if directory is not None:
         check_out(directory, session.store.root)

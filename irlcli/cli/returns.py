@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 from irlcli.cli import console as out
-from irlcli.report.returns import Measured, rows
+from irlcli.report.returns import EvaluationRun, rows
 
 
-def print_rows(evaluations: Sequence[Measured], stderr: bool = False) -> None:
+def print_rows(evaluations: Sequence[EvaluationRun], stderr: bool = False) -> None:
     """A table row for each agent and setting."""
     found = rows(evaluations)
     table = [

@@ -10,7 +10,7 @@ from irlcli.cli import console as out
 from irlcli.cli.session import StageSession
 from irlcli.errors import NotFound, StageFailed, UsageError
 from irlcli.report.tables import EVERY_CELL
-from irlcli.requests.tables import Choice, needs_tag
+from irlcli.requests.tables import TableChoice, needs_tag
 from irlcli.store import Artefact, read_json
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from irlcli.stages.base import Request
 
 
-def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":
+def report_of(session: StageSession, choice: TableChoice, plan: "Plan") -> "Request":
     """The report on what the store holds of a whole table.
 
     Raises:
@@ -45,7 +45,7 @@ def report_of(session: StageSession, choice: Choice, plan: "Plan") -> "Request":
         raise
 
 
-def _run_line(session: StageSession, choice: Choice) -> str:
+def _run_line(session: StageSession, choice: TableChoice) -> str:
     """The command line that makes what a report on ``choice`` lacks, for a hint."""
     tag = ["--tag", "NAME"] if needs_tag(session, choice) else []
     return session.suggestion("run", choice.table, *choice.words(), *tag)

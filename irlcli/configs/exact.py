@@ -31,9 +31,9 @@ class GridworldConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class MaxEntConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Tractable maximum-entropy IRL (paper Sec. 4.2, 5.1, App. A, C).
 
-    ``grouping`` and ``penalty`` are those of :class:`irlcli.configs.schema.AIRLConfig`. The reward is an MLP's scalar
-    output (``features = "learned"``) or linear in the ``inputs`` of a state. ``held_out``
-    episodes of each setting's expert measure the likelihood. lambda is zero for the first
+    ``grouping`` and ``penalty`` are those of :class:`irlcli.configs.schema.AIRLConfig`. The reward
+    is an MLP's scalar output (``features = "learned"``) or linear in the ``inputs`` of a state.
+    ``held_out`` episodes of each setting's expert measure the likelihood. lambda is zero for the first
     ``penalty_warmup_iterations``; none if unset.
     """
 

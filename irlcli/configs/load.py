@@ -188,7 +188,7 @@ def _airl(layers: Layers, knob: str | None = None) -> AIRLConfig:
 
 
 def _section(section: str, layers: Layers, knob: str | None) -> dict[str, Any]:
-    """``[section]`` of all layers, with what ``knob`` has different.
+    """``[section]`` of all layers, with ``knob``'s own overrides.
 
     In each layer the knob's own table wins over ``[section]``; a later layer wins over both.
     """

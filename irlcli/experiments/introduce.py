@@ -24,7 +24,7 @@ class _Made(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def introduce(artefact: Artefact) -> None:
-    """Let the name of the environment that ``artefact`` was made in be known.
+    """Register the environment that ``artefact`` was made in.
 
     An environment that the user named by its file stays.
 

@@ -11,7 +11,7 @@ import msgspec
 from irlcli.configs import Config
 from irlcli.errors import UsageError, closest
 from irlcli.experiments import figures, rows
-from irlcli.experiments.rows import PHASES, Chosen, Run, Task
+from irlcli.experiments.rows import PHASES, Chosen, RewardRun, Task
 from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
 from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
@@ -121,16 +121,18 @@ class Plan:
                 Chosen(self.selection.candidates, self.lookup),
             )
 
-    def _runs(self, row: Row) -> list[Run]:
+    def _runs(self, row: Row) -> list[RewardRun]:
         """The row's rewards; that alone which the selected step is about, if it is about one."""
         methods, seeds = self.table.methods, self.table.seeds
         runs = [
-            Run(variant.name, method, seed, f"{row}.{step_name(variant)}", self._under[variant])
+            RewardRun(
+                variant.name, method, seed, f"{row}.{step_name(variant)}", self._under[variant]
+            )
             for variant in self.table.variants
             for method in methods
             for seed in seeds
         ] or [
-            Run(method, method, seed, str(row), self._weighted.get(method, self._configs))
+            RewardRun(method, method, seed, str(row), self._weighted.get(method, self._configs))
             for method in methods
             for seed in seeds
         ]

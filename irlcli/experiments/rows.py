@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import msgspec
 
 from irlcli import labels
+from irlcli.data import descriptions
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.experiments.bank import Policies, Retrained, bank
@@ -70,7 +71,7 @@ class Task(NamedTuple):
     curves: Mapping[str, Request] = {}
 
 
-class Run(NamedTuple):
+class RewardRun(NamedTuple):
     """One reward of a row, and all that is made with it.
 
     Attributes:
@@ -92,7 +93,7 @@ class Run(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Candidates for lambda, ``own`` for each penalty's, and the store that knows which of them was chosen."""
+    """Candidates for lambda, and the store that knows which was chosen; ``own``: each penalty's."""
 
     candidates: Sequence[float] | Literal["own"]
     lookup: Lookup
@@ -106,7 +107,7 @@ class Chosen(NamedTuple):
         if file_digest(path) != made.output("choice.json").sha256:
             # What needs it reports the damage when it reads the file.
             return None
-        return msgspec.convert(read_json(path), choose_penalty.Choice).chosen
+        return descriptions.convert(read_json(path), choose_penalty.Choice, path).chosen
 
 
 class _RowRequests:
@@ -184,7 +185,7 @@ class _Reward(NamedTuple):
     requests: _RowRequests
     demos: Request
     learned: Request
-    run: Run
+    run: RewardRun
     measures: Sequence[str]
 
     @property
@@ -199,7 +200,7 @@ def comparison(
     row: Row,
     measures: Sequence[str],
     retrainings: int,
-    runs: Sequence[Run],
+    runs: Sequence[RewardRun],
     configs: Configs,
     chosen: Chosen,
 ) -> Iterator[Task]:
@@ -263,7 +264,7 @@ def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator
 def _run(
     requests: _RowRequests,
     demos: Request,
-    run: Run,
+    run: RewardRun,
     measures: Sequence[str],
     retrainings: int,
     chosen: Chosen,

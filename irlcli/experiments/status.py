@@ -126,7 +126,8 @@ class Lookup:
             return Step(
                 "RUN",
                 label,
-                f"{there.problem}: the next run moves it to quarantine and exits with 4; run again to compute it",
+                f"{there.problem}: the next run moves it to quarantine and exits with 4; "
+                "run again to compute it",
                 key=key,
             )
         found = self._find_elsewhere(key)

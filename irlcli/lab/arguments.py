@@ -20,7 +20,7 @@ _R = TypeVar("_R")
 
 
 class Configs(TypedDict, total=False):
-    """What a single call has different from its lab.
+    """What one call overrides of its lab's configs.
 
     Attributes:
         profile, settings: instead of the lab's.

@@ -407,7 +407,7 @@ class Lab:
 
         Args:
             table: ``table1``, ...
-            seeds, methods, rows: only these, of the table's.
+            seeds, methods, rows: a subset of the table's.
             choose_penalty: candidates for lambda, or ``own``.
             until: last phase: ``experts``, ``demos``, ``rewards``, ``transfers`` or ``returns``.
             only: one step and what it needs.
@@ -415,7 +415,7 @@ class Lab:
             experiments: TOML file with tables, instead of ``settings/experiments.toml``.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        chosen = planning.Choice(
+        chosen = planning.TableChoice(
             table,
             joined(seeds),
             joined(methods),

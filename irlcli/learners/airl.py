@@ -6,8 +6,8 @@ Algorithm 1, as this module reads from top to bottom. In every round
    challenger, if there is one, on the reward alone (:meth:`AIRL.challenger_rewards`);
 2. the round's episodes become samples labelled *policy*, the demonstrations samples labelled
    *expert*, grouped into risks (:meth:`AIRL.update`);
-3. the discriminator minimises :func:`~irlcli.learners.discriminator.discriminator_loss`, the mean of the risks' cross-entropies
-   plus lambda times the penalty.
+3. the discriminator minimises :func:`~irlcli.learners.discriminator.discriminator_loss`, the mean
+   of the risks' cross-entropies plus lambda times the penalty.
 
 Tensors in, tensors out: files, logging and the RL library stay outside. Samples are laid out
 [E, 2, B]: E risks, label 0 = policy and 1 = expert, B samples of each.

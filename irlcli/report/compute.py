@@ -116,9 +116,9 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     Columns: ``row``, ``agent``, ``measure``, ``setting``; ``seeds`` and ``seeds_wanted``; ``mean``,
     ``deviation`` (n - 1), ``low`` and ``high`` (95 % bootstrap interval) and ``iqm`` of the true
     return over seeds; ``progress``, its mean; ``complete``, whether all evaluations exist;
-    ``partial``, whether a seed in the mean lacks some; ``mixed``, whether the runs behind them differ in code or libraries; ``of_expert``, the mean
-    over that of the training settings' experts, in distribution; ``imitated``, see
-    :func:`imitates`; ``between_retrainings``, see :func:`between_retrainings`.
+    ``partial``, whether a seed in the mean lacks some; ``mixed``, whether the runs behind them
+    differ in code or libraries; ``of_expert``, the mean over that of the training settings' experts,
+    in distribution; ``imitated``, see :func:`imitates`; ``between_retrainings``, see :func:`between_retrainings`.
     """
     found = []
     for row in p.rows:

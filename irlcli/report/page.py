@@ -42,8 +42,8 @@ def markdown(p: Parameters, report: Report) -> str:
     parts.append("## Files\n")
     parts.append(
         f"`{p.kind}.csv`: a row per cell. `seeds.csv`: a row per seed and setting. `comparisons.csv`: a "
-        f"row per comparison. {_VARIANT_FILES * bool(p.variants)}`{p.kind}.json`: all numbers. `{p.kind}.html`: all of this with learning "
-        f"curves and lineage on one page. `{p.kind}.tex`: needs booktabs and longtable. `{p.kind}.png`, "
+        f"row per comparison. {_VARIANT_FILES * bool(p.variants)}`{p.kind}.json`: all numbers. "
+        f"`{p.kind}.html`: all of this with learning curves and lineage on one page. `{p.kind}.tex`: needs booktabs and longtable. `{p.kind}.png`, "
         f"`.pdf`: {(_SHARES if p.variants else _RETURNS).lower()}\n"
     )
     return "\n".join(parts)

@@ -16,7 +16,7 @@ class Printed(NamedTuple):
     deviation: float
 
 
-class Row(NamedTuple):
+class PrintedRow(NamedTuple):
     """A row of Table 1; ``p_value`` as printed."""
 
     erm: Printed
@@ -26,16 +26,16 @@ class Row(NamedTuple):
 
 
 TABLE1 = {
-    ("lunar-lander", "bounce"): Row(
+    ("lunar-lander", "bounce"): PrintedRow(
         Printed(93.1, 30.6), Printed(156.8, 53.1), Printed(230.3, 15.6), 0.0458
     ),
-    ("lunar-lander", "engine-power"): Row(
+    ("lunar-lander", "engine-power"): PrintedRow(
         Printed(54.3, 64.5), Printed(134.7, 40.2), Printed(204.8, 22.3), 0.0456
     ),
-    ("ant", "friction"): Row(
+    ("ant", "friction"): PrintedRow(
         Printed(542.7, 114.5), Printed(783.9, 72.4), Printed(1223.2, 187.2), 0.0041
     ),
-    ("ant", "leg-length"): Row(
+    ("ant", "leg-length"): PrintedRow(
         Printed(640.7, 87.3), Printed(859.3, 94.1), Printed(1394.6, 154.3), 0.0052
     ),
 }

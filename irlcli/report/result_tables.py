@@ -20,8 +20,8 @@ from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
     "Mean true return ± standard deviation over seeds. p: Welch's test, "
-    f"{title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a p-value. (3/5): three of five seeds exist; (part): "
-    "some evaluations are missing. † not imitated in distribution. ‡ runs of more than one commit "
+    f"{title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a p-value. "
+    "(3/5): three of five seeds exist; (part): some evaluations are missing. † not imitated in distribution. ‡ runs of more than one commit "
     "or set of libraries. Training experts, reused: the experts of the training settings, each "
     "evaluated where the students are, their mean: the return without learning a reward. Progress: "
     "the part of the return earned by walking or reaching (an idle ant earns about 600 for being "
@@ -59,13 +59,15 @@ _QUALITY_NOTE = (
     "policy's learned return is at least the expert's; else optimisation fell short."
 )
 _COMPARISON_NOTE = (
-    "Two-sided p-values. Welch's test is the primary one. Holm: adjusted over the rows, separately for "
-    "each measure and pair of methods; in an ablation over all rows and variants of a measure. Paired: t-test over the seeds that both "
-    "methods have (their number in brackets), which share initialisation and starts; - where the "
-    "differences do not vary or fewer than two pairs exist. Student's test assumes equal variances; "
-    "the paper used it (its value is recomputed from its means and deviations, n = 5). Rank: the Mann-Whitney test, on the order of the seeds alone; three against "
-    "three seeds give at least 0.1, five against five 0.008. P(better): "
-    "probability that a seed of the first method beats one of the second, ties count half."
+    "Two-sided p-values. Welch's test is the primary one. Holm: adjusted over the rows, "
+    "separately for each measure and pair of methods; in an ablation over all rows and variants "
+    "of a measure. Paired: t-test over the seeds that both methods have (their number in "
+    "brackets), which share initialisation and starts; - where the differences do not vary or "
+    "fewer than two pairs exist. Student's test assumes equal variances; the paper used it (its "
+    "value is recomputed from its means and deviations, n = 5). Rank: the Mann-Whitney test, on "
+    "the order of the seeds alone; three against three seeds give at least 0.1, five against "
+    "five 0.008. P(better): probability that a seed of the first method beats one of the second, "
+    "ties count half."
 )
 _DISCRIMINATOR_NOTE = (
     "Over the last tenth of the rounds, means over settings and seeds. This round: after the update, on "
@@ -78,14 +80,17 @@ _DISCRIMINATOR_NOTE = (
 )
 _CELL_NOTE = (
     "95 %: percentile bootstrap interval of the mean over seeds, too narrow with few seeds. IQM: "
-    "mean of the middle half of the seeds. Retrainings: standard deviation between policies trained on "
-    "one reward, pooled over rewards; the sd over seeds is of their means. Expert, random and idle are one policy each; the reused "
-    "experts are one policy per training setting."
+    "mean of the middle half of the seeds. Retrainings: standard deviation between policies "
+    "trained on one reward, pooled over rewards; the sd over seeds is of their means. Expert, "
+    "random and idle are one policy each; the reused experts are one policy per training "
+    "setting."
 )
 _BUDGET_NOTE = (
-    "Steps: the budget in whole rounds; the steps of challengers are not counted. Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
-    "where the table has its own, by method and seed where it was chosen by leaving a setting out. Round: the one that was kept. "
-    "At most: training could end earlier by airl.plateau_rounds; `stopped_after` in reward.json is the round."
+    "Steps: the budget in whole rounds; the steps of challengers are not counted. "
+    "Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
+    "where the table has its own, by method and seed where it was chosen by leaving a setting "
+    "out. Round: the one that was kept. At most: training could end earlier by "
+    "airl.plateau_rounds; `stopped_after` in reward.json is the round."
 )
 _COST_NOTE = (
     "Wall-clock time of one process on a machine shared with other runs. A resumed run counts each "
@@ -143,14 +148,14 @@ def _measure(
     return Table(MEASURES[measure], note, columns, lines, heads=2)
 
 
-def paper_row(p: Parameters, row: Row, measure: str) -> paper.Row | None:
+def paper_row(p: Parameters, row: Row, measure: str) -> paper.PrintedRow | None:
     """The paper's numbers for ``row``, if it printed any for this report and measure."""
     if p.kind != "table1" or measure != "transfer":
         return None
     return paper.TABLE1.get((row.env, row.knob))
 
 
-def _paper_p(row: paper.Row, equal_variances: bool) -> float:
+def _paper_p(row: paper.PrintedRow, equal_variances: bool) -> float:
     n = paper.SEEDS
     test = ttest_ind_from_stats(*row.irm, n, *row.erm, n, equal_var=equal_variances)
     return float(test.pvalue)

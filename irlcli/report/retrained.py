@@ -16,9 +16,9 @@ def by_training_setting(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """Policies retrained in each training setting, a row per row, setting and method.
 
     Columns: ``row``, ``setting``, ``agent``, ``seeds``; ``mean`` and ``deviation`` (n - 1) of the
-    true return over seeds that have all their retrainings there, each the mean of them; ``progress``, its mean; ``expert``,
-    the return of that setting's own expert; ``of_expert``, the mean over it, None unless the
-    expert's is positive.
+    true return over seeds that have all their retrainings there, each the mean of them;
+    ``progress``, its mean; ``expert``, the return of that setting's own expert; ``of_expert``, the
+    mean over it, None unless the expert's is positive.
     """
     columns = ["row", "setting", "agent", "seeds", "mean", "deviation", "progress"]
     columns += ["expert", "of_expert"]

@@ -12,13 +12,13 @@ from irlcli.interventions import covers, parse_setting
 from irlcli.report.agents import title
 
 # A summary, the parameters behind it that seeds share, and whether its reward is the policy's own.
-Measured = tuple[Evaluation, Mapping[str, Any], bool]
+EvaluationRun = tuple[Evaluation, Mapping[str, Any], bool]
 
 _ORDER = ("expert", "student", "transfer", "clone", "random", "idle")
 _HINT = "the runs in a row may differ in their seed only: report the others separately"
 
 
-class Row(NamedTuple):
+class AgentRow(NamedTuple):
     """One agent in one setting, a sample over seeds.
 
     Attributes:
@@ -51,7 +51,7 @@ class Row(NamedTuple):
         return math.sqrt(squares / (len(self.returns) - 1))
 
 
-def rows(evaluations: Iterable[Measured]) -> list[Row]:
+def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
     """A row per agent, method and setting: experts first, random and idle last.
 
     An agent that was scored by another reward than its own has a row for each method of such
@@ -103,12 +103,12 @@ def rows(evaluations: Iterable[Measured]) -> list[Row]:
             policies.setdefault(seed, []).append(true_return)
         returns = tuple(math.fsum(each) / len(each) for each in policies.values())
         found.append(
-            Row(agent, env, setting, returns, min(episodes), _mean(progress), _mean(learned))
+            AgentRow(agent, env, setting, returns, min(episodes), _mean(progress), _mean(learned))
         )
     return found
 
 
-def as_json(evaluations: Iterable[Measured]) -> list[dict[str, Any]]:
+def as_json(evaluations: Iterable[EvaluationRun]) -> list[dict[str, Any]]:
     """A document for each of the :func:`rows`."""
     return [
         {

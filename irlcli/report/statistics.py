@@ -87,8 +87,9 @@ def rank_test(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """The Mann-Whitney test of ``x`` [n] against ``y`` [m]: its two-sided p, and P(better).
 
     P(better) is P(X > Y) + P(X = Y) / 2 over all pairs (Agarwal et al. 2021). Both depend on the order
-    of the values alone, so one extreme value does not hide a difference. Exact, but for ties among so many values that there are more than 9999 ways to split them: then
-    a random sample of the splits is counted.
+    of the values alone, so one extreme value does not hide a difference. p is exact, but for ties
+    among so many values that there are more than 9999 ways to split them: then a random sample of the
+    splits is counted.
     """
     values = np.concatenate([x, y])
     ties = len(np.unique(values)) < len(values)

@@ -135,7 +135,7 @@ def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
 def warn_of_seen(
     console: "RunConsole", settings: Sequence[Setting], origin: "Reward | Policy", ref: str
 ) -> None:
-    """Warn of every setting beside ``--ood`` that ``origin``, which ``ref`` names, was trained in."""
+    """Warn of each ``--ood`` setting that ``origin``, which ``ref`` names, was trained in."""
     for setting in settings:
         if str(setting) in origin.settings:
             console.warn(f"{setting} is not held out: {ref!r} was trained in it")
@@ -175,7 +175,7 @@ def experts(
 
 
 def _expert(env: str, text: str) -> tuple[Setting, str]:
-    """The setting, and the file or reference, of which either may hold an equals sign."""
+    """The setting, and the file or reference. Both may contain ``=``."""
     first: UsageError | None = None
     for at in reversed([i for i, letter in enumerate(text) if letter == "="]):
         try:
@@ -189,7 +189,7 @@ def _expert(env: str, text: str) -> tuple[Setting, str]:
 
 
 def env_name(ref: str | None) -> str | None:
-    """The name of the environment that ``--env`` names, which is known from now on.
+    """Registers the environment that ``--env`` names; returns its name.
 
     Raises:
         UsageError, NotFound: no such environment, or a malformed file.

@@ -1,4 +1,4 @@
-"""What ``--set`` asks for, beside what requests hold."""
+"""Warnings about ``--set``: fields that no stage reads, and values that something replaced."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from types import SimpleNamespace

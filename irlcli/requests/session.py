@@ -86,7 +86,7 @@ class StageSession(Session):
 
     Args:
         profile, file, overrides: as for :func:`irlcli.configs.load_config`.
-        asked: those of ``overrides`` that were given for what is run now, all of them by default.
+        asked: the overrides that this call gave; by default all.
         sources: other stores, directories or URLs, to copy missing artefacts from.
         command: the command line that artefacts record, so that a damaged one shows its repair.
         workers: processes that step environments.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _LONGEST_PART = 50
 
 
-class Choice(NamedTuple):
+class TableChoice(NamedTuple):
     """The options that choose a part of a table."""
 
     table: str
@@ -63,13 +63,13 @@ class Choice(NamedTuple):
         ]
 
 
-def needs_tag(session: StageSession, choice: Choice) -> bool:
+def needs_tag(session: StageSession, choice: TableChoice) -> bool:
     """Whether results need names of their own: their configs are not those of the profile."""
     other = session.file or session.overrides or choice.choose_penalty is not None
     return choice.tag is None and bool(other)
 
 
-def check_tag(session: StageSession, choice: Choice) -> None:
+def check_tag(session: StageSession, choice: TableChoice) -> None:
     """Refuse names that are those of other results.
 
     Raises:
@@ -82,7 +82,7 @@ def check_tag(session: StageSession, choice: Choice) -> None:
         )
 
 
-def open_plan(session: StageSession, choice: Choice) -> "Plan":
+def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
     """The plan of the chosen part of a table. The table's settings file becomes the session's.
 
     Raises:

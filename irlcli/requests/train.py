@@ -3,6 +3,7 @@
 import msgspec
 
 from irlcli.configs.load import unseen_settings
+from irlcli.data import descriptions
 from irlcli.errors import UsageError
 from irlcli.experiments.references import demonstrations
 from irlcli.experiments.status import source_of
@@ -90,7 +91,7 @@ def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | N
     if made is None:
         return None
     path = session.store.open(made, "choice.json")
-    found = msgspec.convert(read_json(path), choice.Choice)
+    found = descriptions.convert(read_json(path), choice.Choice, path)
     tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
     tried = ",".join(f"{weight:g}" for weight in found.weights)
     session.console.say(f"lambda {found.chosen:g} was the best of {tried}{tied} ({path})")

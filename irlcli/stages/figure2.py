@@ -33,18 +33,18 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def request(
-    env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Config
+    env: str, settings: Sequence[Setting], unseen: Sequence[Setting], config: Config
 ) -> Request:
     """Outputs ``figure2.png``, ``.pdf``, ``.csv`` (every measure) and ``README.md`` (the table).
 
     Raises:
         UsageError: as :func:`irlcli.stages.sweep_maxent.request`.
     """
-    sweep = sweep_maxent.request(env, settings_, unseen, config)
-    seed, drawn = next(iter(sweep_maxent.datasets(env, settings_, config).items()))
+    sweep = sweep_maxent.request(env, settings, unseen, config)
+    seed, drawn = next(iter(sweep_maxent.datasets(env, settings, config).items()))
     parameters = Parameters(
         environment=environment_key(env),
-        settings=tuple(str(s) for s in settings_),
+        settings=tuple(str(s) for s in settings),
         unseen=tuple(str(s) for s in unseen),
         seed=seed,
         shared=sweep_maxent.shared_config(config),

@@ -88,29 +88,29 @@ def shared_config(config: Config) -> MaxEntConfig:
     return replace(relevant, **asdict(SweepVariant(grouping="pooled")))
 
 
-def datasets(env: str, settings_: Sequence[Setting], config: Config) -> dict[int, Request]:
+def datasets(env: str, settings: Sequence[Setting], config: Config) -> dict[int, Request]:
     """The demonstrations that the sweep learns from, by seed."""
     f: Figure2Config = config.figure2
     return {
-        seed: collect_experts.request(env, settings_, config, seed, f.episodes)
+        seed: collect_experts.request(env, settings, config, seed, f.episodes)
         for seed in range(f.first_seed, f.first_seed + f.seeds)
     }
 
 
 def request(
-    env: str, settings_: Sequence[Setting], unseen: Sequence[Setting], config: Config
+    env: str, settings: Sequence[Setting], unseen: Sequence[Setting], config: Config
 ) -> Request:
     """Fit all :func:`variants` to every dataset, and judge the rewards.
 
     Outputs ``rewards.parquet`` (a row per variant and seed) and ``quality.parquet`` (a row per
-    variant, seed and setting, of ``settings_`` and of ``unseen``).
+    variant, seed and setting, of ``settings`` and of ``unseen``).
 
     Raises:
         UsageError: an environment that is not tabular, or counts that do not fit the settings.
     """
     check_tabular(env, "sweep-maxent", wanted=True)
-    texts = tuple(str(s) for s in settings_)
-    requests = datasets(env, settings_, config)
+    texts = tuple(str(s) for s in settings)
+    requests = datasets(env, settings, config)
     parameters = Parameters(
         environment=environment_key(env),
         settings=texts,

@@ -48,23 +48,23 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 def request(
     demos: Source | From,
     env: str,
-    settings_: Sequence[Setting],
+    settings: Sequence[Setting],
     unseen: Sequence[Setting],
     maxent: MaxEntConfig,
     seed: int = 0,
 ) -> Request:
-    """A reward learned from ``demos``, recorded in ``settings_`` of ``env``.
+    """A reward learned from ``demos``, recorded in ``settings`` of ``env``.
 
     Outputs ``reward.pt`` (a tensor file of kind ``tabular-reward``), its description as JSON,
     ``metrics.parquet`` with a row per record and setting, and ``quality.json``: how the policy
-    that is optimal for the reward performs at the true task, in ``settings_`` and in ``unseen``.
+    that is optimal for the reward performs at the true task, in ``settings`` and in ``unseen``.
 
     Raises:
         UsageError: an environment that is not tabular, a penalty that MaxEnt IRL does not have, or
             one that compares settings where there is one.
     """
     check_tabular(env, "train-maxent", wanted=True)
-    texts = tuple(str(s) for s in settings_)
+    texts = tuple(str(s) for s in settings)
     relevant = relevant_maxent(maxent)
     parameters = Parameters(
         environment=environment_key(env),

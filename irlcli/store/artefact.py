@@ -122,7 +122,8 @@ def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[s
 def recorded_command(directory: Path, layout: Layout) -> str:
     """The command line that made an artefact, to be repeated in the store ``layout``.
 
-    Without ``--out``: its files lie beside the store, and may be another store's by now. Empty if the provenance, which may be damaged, cannot be read.
+    Without ``--out``: its files lie beside the store, and may be another store's by now. Empty if
+    the provenance, which may be damaged, cannot be read.
     """
     import shlex
 

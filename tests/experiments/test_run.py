@@ -21,7 +21,7 @@ from irlcli.experiments.failures import Failure
 from irlcli.experiments.runner import Runner, Silent
 from irlcli.interventions import parse_settings
 from irlcli.requests.session import StageSession
-from irlcli.requests.tables import Choice, open_plan
+from irlcli.requests.tables import TableChoice, open_plan
 from irlcli.stages import train_expert
 from irlcli.store import Store
 from irlcli.store.sources import open_sources
@@ -311,7 +311,7 @@ def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):
     store.create()
     line = {"profile": "smoke", "file": None, "overrides": [], "sources": [], "command": ["irl"]}
     session = StageSession(store.root, Silent(), **line)
-    choice = Choice("tiny", choose_penalty="1,10", until="rewards", tag="x", file=tables)
+    choice = TableChoice("tiny", choose_penalty="1,10", until="rewards", tag="x", file=tables)
     plan, others = (open_plan(session, choice) for _ in range(2))
     reward = "x.lunar-lander.engine-power.irm.0"
 

@@ -14,7 +14,7 @@ from test_architecture import loaded_by
 from irlcli.configs import load_config
 from irlcli.envs.registry import environment
 from irlcli.experiments.tables import load_tables
-from irlcli.requests.tables import Choice
+from irlcli.requests.tables import TableChoice
 from irlcli.store import Store
 from irlcli.store.manifest import encode_provenance
 
@@ -570,7 +570,9 @@ def test_make_passes_its_variables_on():
     assert "--name standard.table1 " in report
     assert report.endswith("--out results/standard/table1")
     part = commands("report-table1", "ROWS=ant", "METHODS=irm,erm", "SEEDS=1 0")[0]
-    assert f"--name {Choice('table1', '1 0', 'irm,erm', 'ant').report_name('standard')} " in part
+    assert (
+        f"--name {TableChoice('table1', '1 0', 'irm,erm', 'ant').report_name('standard')} " in part
+    )
     assert part.endswith("--out results/standard/table1-ant-erm-irm-seeds-0-1")
     own = [name for name, table in load_tables().items() if table.settings is not None]
     assert len(own) == 3
