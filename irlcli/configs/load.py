@@ -220,6 +220,11 @@ def overridden(items: Sequence[str]) -> dict[str, Any]:
     return values
 
 
+def field_of(item: str) -> str:
+    """The field that ``item``, ``FIELD=VALUE`` as for ``--set``, names."""
+    return item.partition("=")[0].strip()
+
+
 def settings_directory() -> Path:
     """``settings/`` of the checkout, or its copy inside an installed package."""
     packaged = Path(__file__).parent.parent / "settings_files"
@@ -389,12 +394,11 @@ def _override(item: str) -> dict[str, Any]:
 
 
 def _field_of(item: str, nested: Mapping[str, Any]) -> tuple[str, Any]:
-    """The field that ``item`` of ``--set`` names, and its value in ``nested``."""
-    dotted = item.partition("=")[0].strip()
+    """The field that ``item`` names, and its value in ``nested``."""
     value: Any = nested
-    for name in dotted.split("."):
+    for name in field_of(item).split("."):
         value = value[name]
-    return dotted, value
+    return field_of(item), value
 
 
 def _homes(name: str) -> list[str]:

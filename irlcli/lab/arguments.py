@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypedDict, TypeVar
 
+from irlcli.configs.load import field_of
 from irlcli.errors import IrlError, UsageError, file_failure, suggest
 
 Overrides = Mapping[str, Any] | Sequence[str]
@@ -107,12 +108,8 @@ def overrides(given: Overrides) -> list[str]:
 
 def merged(first: Sequence[str], later: Sequence[str]) -> list[str]:
     """Both lists of ``FIELD=VALUE``, without those of ``first`` whose field ``later`` sets too."""
-    fields = {_field(item) for item in later}
-    return [*(item for item in first if _field(item) not in fields), *later]
-
-
-def _field(item: str) -> str:
-    return item.partition("=")[0].strip()
+    fields = {field_of(item) for item in later}
+    return [*(item for item in first if field_of(item) not in fields), *later]
 
 
 def _toml(value: Any) -> str:

@@ -211,7 +211,7 @@ class Lab:
             "choose_penalty": joined(choose_penalty),
             "select": select,
             "state_only": state_only,
-            "env": None if env is None else str(env),
+            "env": joined(env),
             "seed": whole("seed", seed),
         }
         with self._at_work(configs, words("train-airl", options)) as session:
@@ -290,7 +290,7 @@ class Lab:
             "setting": listed(setting),
             "algorithm": algorithm,
             "start": start,
-            "env": None if env is None else str(env),
+            "env": joined(env),
             "seed": whole("seed", seed),
         }
         with self._at_work(configs, words("transfer", options)) as session:
@@ -339,7 +339,7 @@ class Lab:
             "ood": joined(ood),
             "intervention": joined(intervention),
             "setting": listed(setting),
-            "env": None if env is None else str(env),
+            "env": joined(env),
             "episodes": None if episodes is None else whole("episodes", episodes, 1),
             "seed": whole("seed", seed),
         }
@@ -380,7 +380,7 @@ class Lab:
             "intervention": joined(intervention),
             "setting": listed(setting),
             "demos": None if demos is None else self._ref(demos),
-            "env": None if env is None else str(env),
+            "env": joined(env),
             "episodes": None if episodes is None else whole("episodes", episodes, 1),
             "seed": whole("seed", seed),
         }

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import msgspec
 
 from irlcli.configs.fields import NonNegative
+from irlcli.configs.load import field_of
 from irlcli.envs.registry import environment, resolve
 from irlcli.errors import UsageError, suggest
 from irlcli.interventions import (
@@ -283,7 +284,7 @@ def weights(text: str) -> list[float] | Literal["own"]:
 
 def weights_set(overrides: Sequence[str]) -> list[str]:
     """Those of ``--set`` that set lambda of AIRL."""
-    return [item for item in overrides if item.partition("=")[0].strip() == PENALTY_WEIGHT]
+    return [item for item in overrides if field_of(item) == PENALTY_WEIGHT]
 
 
 def check_chosen(choose_penalty: str | None, overrides: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from irlcli.configs.load import overridden
+from irlcli.configs.load import field_of, overridden
 from irlcli.configs.schema import UNSET_MEANS
 from irlcli.stages.base import From, Request
 
@@ -74,7 +74,7 @@ def unread(overrides: Sequence[str], stages: Iterable[str]) -> Iterator[str]:
 
         read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
     for item in overrides:
-        field = item.partition("=")[0].strip()
+        field = field_of(item)
         if not any(f"{field}.".startswith(f"{part}.") for part in read):
             yield item
 

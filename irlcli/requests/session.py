@@ -232,7 +232,9 @@ class StageSession(Session):
 
 def _check_repeated(overrides: Sequence[str]) -> None:
     """Refuse a field that ``--set`` names twice: only the last value would count."""
-    fields = [item.partition("=")[0].strip() for item in overrides]
+    from irlcli.configs.load import field_of
+
+    fields = [field_of(item) for item in overrides]
     for field in fields:
         if fields.count(field) > 1:
             raise UsageError(f"--set {field} is given twice", f"give {field} once")

@@ -117,7 +117,7 @@ def test_an_environments_error_names_the_worker_and_its_worlds():
     worlds = WorkerWorlds(
         [Fragile, Fragile, partial(Fragile, fail_at=2)], max_episode_steps=100, workers=2
     )
-    pids = [process.pid for process in worlds._processes]
+    pids = [process.pid for process in multiprocessing.active_children()]
     worlds.reset([0, 0, 0])
     worlds.step(np.zeros(3, dtype=np.int64))
     message = r"worker 0 \(worlds 0, 2\): ArithmeticError: the sums do not add up"
@@ -157,7 +157,7 @@ def test_what_cannot_be_pickled_leaves_no_half_message():
 
 def test_a_dead_worker_is_reported_and_the_others_are_ended():
     worlds = WorkerWorlds([Fragile, partial(Fragile, die_at=2)], max_episode_steps=100, workers=2)
-    pids = [process.pid for process in worlds._processes]
+    pids = [process.pid for process in multiprocessing.active_children()]
     worlds.reset([0, 0])
     worlds.step(np.zeros(2, dtype=np.int64))
     with pytest.raises(WorkerFailed, match=r"worker 1 \(world 1\) died: signal 9"):
@@ -166,7 +166,7 @@ def test_a_dead_worker_is_reported_and_the_others_are_ended():
 
 
 PARENT = """
-import sys, time
+import multiprocessing, sys, time
 sys.path.insert(0, {here!r})
 import numpy as np
 from test_workers import Fragile
@@ -175,7 +175,7 @@ from irlcli.envs.workers import WorkerWorlds
 if __name__ == "__main__":
     worlds = WorkerWorlds([Fragile] * 2, max_episode_steps=100, workers=2)
     worlds.reset([0, 0])
-    print(*[process.pid for process in worlds._processes], flush=True)
+    print(*[process.pid for process in multiprocessing.active_children()], flush=True)
     # A limit, because the test itself may be killed.
     end = time.monotonic() + {seconds}
     while time.monotonic() < end:
@@ -188,7 +188,7 @@ def test_a_signal_to_the_whole_group_leaves_the_workers_to_the_parent(stop):
     worlds = WorkerWorlds([Fragile] * 2, max_episode_steps=100, workers=2)
     try:
         worlds.reset([0, 0])
-        for process in worlds._processes:
+        for process in multiprocessing.active_children():
             os.kill(process.pid, stop)
         worlds.step(np.zeros(2, dtype=np.int64))
     finally:

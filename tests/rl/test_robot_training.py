@@ -104,7 +104,7 @@ def test_a_clone_is_the_maximum_likelihood_fit():
     rng = np.random.default_rng(0)
     observations = rng.normal(3.0, 2.0, (4096, 9)).astype(np.float32)
     actions = rng.normal([0.5, -0.3], [0.2, 0.6], (4096, 2)).astype(np.float32)
-    view = ActionView("sampled", action_space(trainer._venv.action_space))
+    view = ActionView("sampled", action_space(trainer.model.action_space))
     before = trainer.policy.state_dict()["value_net.weight"].clone()
     clone(trainer, demonstrated(observations, actions), view, 150, 0)
     mean, deviation = trainer.policy.gaussian(torch.as_tensor(observations))
