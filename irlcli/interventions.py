@@ -248,7 +248,7 @@ def listed_settings(env: str, knob: str, values: Sequence[str]) -> tuple[Setting
 
 
 def check_distinct(where: str, settings: Sequence[Setting]) -> None:
-    """Refuse settings that are the same world.
+    """Refuse settings that name the same world. A knob at its default and ``default`` are two names.
 
     Raises:
         UsageError: naming ``where`` and the setting that appears twice.
@@ -264,7 +264,7 @@ def check_distinct(where: str, settings: Sequence[Setting]) -> None:
 
 
 def world(setting: Setting) -> dict[str, tuple[float, ...]]:
-    """The numbers of each knob, equal for settings that make the same world: 10 and 10..10."""
+    """The numbers of each knob that a setting names, equal for 10 and 10..10."""
     return {knob: _numbers(value) for knob, value in setting.changes}
 
 

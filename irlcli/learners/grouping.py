@@ -38,7 +38,7 @@ def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> lis
       Otherwise a discriminator could learn how often a setting was demonstrated.
     - ``balanced`` and ``per-setting``: one group per setting, of equal weight. Balanced groups
       share one risk where a penalty looks at risks.
-    - ``shuffled``: as many groups, over episodes dealt out at random by ``rng``. Each setting keeps
+    - ``shuffled``: as many groups, over episodes dealt out by ``rng``, see :func:`deal`. Each setting keeps
       the share of the total weight that it has in ``per-setting``, whatever its count.
     """
     settings = range(len(counts))
@@ -64,16 +64,29 @@ def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> lis
 
 
 def deal(counts: Sequence[int], rng: np.random.Generator) -> list[np.ndarray]:
-    """For each setting e the groups [counts[e]] of its episodes, as even as they can be.
+    """For each setting e the groups [counts[e]] of its episodes.
 
-    Which episode goes to which of the E groups is random; no group stays empty.
+    Which episode goes to which of the E groups is random. Groups hold as many episodes of a setting
+    as each other, but for one. The first groups have that one more of every setting, so groups have
+    the settings in shares as equal as can be. No group stays empty.
     """
+    size = len(counts)
     groups = []
     for setting, count in enumerate(counts):
+        to = (setting + np.arange(count)) % size
+        # Otherwise no setting reaches every group, and the last group would be empty.
+        if max(counts) >= size:
+            more = count % size
+            to[count - more :] = np.arange(more)
         dealt = np.empty(count, dtype=np.int64)
-        dealt[rng.permutation(count)] = (setting + np.arange(count)) % len(counts)
+        dealt[rng.permutation(count)] = to
         groups.append(dealt)
     return groups
+
+
+def hides_settings(counts: Sequence[int]) -> bool:
+    """Whether each of the E settings has an episode in every group that is dealt out."""
+    return min(counts) >= len(counts)
 
 
 def apportion(total: int, shares: Sequence[float]) -> list[int]:

@@ -273,6 +273,17 @@ def frozen_reward(
         )
 
 
+def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
+    """Warn if shuffled labels still tell settings with ``counts`` [E] demonstrations apart."""
+    from irlcli.learners.grouping import hides_settings
+
+    if not hides_settings(counts):
+        job.console.warn(
+            f"shuffled labels still tell the settings apart, so this is no control: a setting has "
+            f"{min(counts)} demonstrations, which {len(counts)} groups cannot share"
+        )
+
+
 def shown(true_return: float, progress: float | None) -> str:
     """A true return for the user, with the environment's progress if it reports one."""
     no_progress = progress is None or progress != progress

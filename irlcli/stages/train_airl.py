@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 from msgspec import UNSET
@@ -27,6 +27,7 @@ from irlcli.stages.base import (
     Stage,
     environment_key,
     run_training,
+    warn_of_labels,
 )
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     airl: AIRLConfig
     penalty_version: int | msgspec.UnsetType = msgspec.UNSET
     selection_version: int | msgspec.UnsetType = msgspec.UNSET
+    # 2: what is left over of every setting is dealt to the same groups.
+    dealing_version: Literal[2] | msgspec.UnsetType = msgspec.UNSET
 
 
 def request(
@@ -104,6 +107,7 @@ def request(
         airl=relevant,
         penalty_version=penalty_version(relevant.penalty),
         selection_version=_selection_version(relevant),
+        dealing_version=2 if relevant.grouping == "shuffled" else msgspec.UNSET,
     )
     check_risks(parameters.airl.penalty, parameters.airl.grouping, trained)
     label = f"train-airl {describe(parameters.airl)} {env} {', '.join(texts)} seed {seed}"
@@ -264,10 +268,8 @@ def _episodes(
         except ValueError as error:
             raise UsageError(str(error), "select by a setting, or record more episodes") from None
         episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
-    if p.airl.grouping == "shuffled" and max(map(len, episodes)) == 1:
-        job.console.warn(
-            "shuffling changes nothing with one demonstration of each setting: this is no control"
-        )
+    if p.airl.grouping == "shuffled":
+        warn_of_labels(job, [len(group) for group in episodes])
     return episodes, held_out
 
 

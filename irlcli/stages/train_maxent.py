@@ -23,6 +23,7 @@ from irlcli.stages.base import (
     Source,
     Stage,
     environment_key,
+    warn_of_labels,
 )
 
 if TYPE_CHECKING:
@@ -96,6 +97,8 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     m = p.maxent
     grid, episodes = read_gridworld(job.inputs["demonstrations"], p.environment.name, p.settings)
+    if m.grouping == "shuffled":
+        warn_of_labels(job, [len(group) for group in episodes])
     settings = tasks.stacked(p.settings, grid)
     learner = side_by_side(settings, grid, [(m, indexed(settings, episodes, grid), p.seed)])
     names = set(learner.state_dict())
@@ -255,4 +258,4 @@ def _number(x: float) -> float | None:
     return None if x != x else float(x)
 
 
-STAGE = Stage("train-maxent", 2, run)
+STAGE = Stage("train-maxent", 3, run)

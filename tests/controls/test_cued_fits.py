@@ -130,6 +130,17 @@ def test_a_setting_that_is_left_out_is_gone(data):
     assert all(len(demos.states) == 1 for demos in without(data, 0).demos)
 
 
+def test_the_penalty_before_is_that_at_the_end_of_the_warm_up(data):
+    """A fit that ends there has it as its last one."""
+    variant = [Variant("per-setting", "irmv1-full", 1e4, warm=True)]
+    short, whole = (
+        fit(replace(CONFIG, iterations=n), data, variant, LINEAR, SEEDS)
+        for n in (CONFIG.warmup + 1, CONFIG.iterations)
+    )
+    np.testing.assert_allclose(whole.penalty_before, short.penalty)
+    assert (whole.penalty < 0.2 * whole.penalty_before).all()
+
+
 def test_variants_come_back_in_the_order_that_they_were_asked_for(data):
     wanted = [Variant("pooled"), Variant("per-setting", "vrex", 10.0), Variant("pooled", l2=5.0)]
     short = replace(CONFIG, iterations=110)

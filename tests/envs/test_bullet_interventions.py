@@ -236,6 +236,20 @@ def test_half_cheetahs_progress_is_its_velocity_toward_the_goal():
     aside.close()
 
 
+@pytest.mark.parametrize("one", [{"goal_y": 900.0}, {"direction": 10.0}])
+def test_half_cheetahs_goals_on_both_sides_differ_in_one_observed_number(one):
+    """It is planar, so such a goal is held out in name only (docs/environments.md)."""
+    (knob, value), *_ = one.items()
+    left, right = started(HalfCheetah(**{knob: -value})), started(HalfCheetah(**one))
+    for _ in range(5):
+        here, there = (env.step(np.full(6, 0.5)) for env in (left, right))
+        np.testing.assert_array_equal(here[0][:-1], there[0][:-1])
+        assert here[0][-1] == -there[0][-1] != 0.0
+        assert here[1] == there[1]
+    left.close()
+    right.close()
+
+
 @pytest.mark.parametrize("robot", [Ant, HalfCheetah])
 def test_a_range_of_directions_is_drawn_per_episode_and_observed(robot):
     env = robot(direction=(-10.0, 0.0))

@@ -71,6 +71,14 @@ def test_the_quality_is_that_of_the_last_rewards():
     assert qualities(rewards, whole).tolist() == [-1, 1, -1, -1, 1]
 
 
+def test_the_qualities_of_the_control_are_those_documented():
+    cues = {env: ENVIRONMENTS[env].knobs["cue-strength"].cue for env in WITH_CUE}
+    assert cues == {
+        "lunar-lander": Cue("engine-power=1x", window=10, bar=-1.0),
+        "half-cheetah": Cue("friction=1.5:0.1:0.1", window=1, bar=0.5),
+    }
+
+
 def acted(env, seed, steps=60):
     """Random actions in the world without its cue, as far as the episode goes."""
     with closing(make(env, without_cue(env, parse_setting(env, "cue-strength=0.8")))) as base:

@@ -136,6 +136,8 @@ def test_instances_do_not_affect_each_other():
         {"bounce": float("nan")},
         {"friction": -1.0},
         {"friction": float("inf")},
+        {"friction": None},
+        {"bounce": "high"},
         {"engine_power": 0.0},
         {"engine_power": float("nan")},
     ],

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from irlcli.learners.grouping import apportion, deal, group
+from irlcli.learners.grouping import apportion, deal, group, hides_settings
 
 COUNTS = st.lists(st.integers(1, 30), min_size=1, max_size=5)
 
@@ -57,6 +57,28 @@ def test_dealt_groups_are_as_even_as_they_can_be():
     assert sorted(np.bincount(dealt[1], minlength=3)) == [1, 1, 2]
     # One episode a setting: each group gets one.
     assert sorted(int(d[0]) for d in deal([1, 1, 1], np.random.default_rng(0))) == [0, 1, 2]
+
+
+@given(count=st.integers(2, 30), settings=st.integers(2, 5), seed=st.integers(0, 1000))
+def test_dealt_groups_do_not_tell_settings_of_equal_counts_apart(count, settings, seed):
+    dealt = deal([count] * settings, np.random.default_rng(seed))
+    if hides_settings([count] * settings):
+        held = [np.bincount(groups, minlength=settings).tolist() for groups in dealt]
+        assert all(each == held[0] and min(each) > 0 for each in held)
+    assert {*np.concatenate(dealt)} == {*range(settings)}
+
+
+@given(seed=st.integers(0, 1000))
+def test_unequal_counts_are_told_apart_by_one_episode_at_most(seed):
+    ten, three = deal([10, 3], np.random.default_rng(seed))
+    assert [np.mean(three == 0) - np.mean(ten == 0)] == pytest.approx([1 / 6])
+    assert not hides_settings([10, 1])
+
+
+def test_each_episode_is_as_likely_in_any_group():
+    groups = np.array([deal([5, 5], np.random.default_rng(seed))[1] for seed in range(2000)])
+    # The first group has three of the five.
+    np.testing.assert_allclose((groups == 0).mean(0), 0.6, atol=0.05)
 
 
 def test_another_seed_deals_otherwise():

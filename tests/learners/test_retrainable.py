@@ -141,6 +141,23 @@ def test_the_gradients_of_student_and_challenger_are_penalised_alike(demos, monk
     torch.testing.assert_close(totals[1] - totals[0], torch.tensor(0.5 * 4.0))
 
 
+@pytest.mark.parametrize(("grouping", "merged"), [("balanced", True), ("per-setting", False)])
+def test_balanced_settings_share_the_risk_that_is_penalised(demos, grouping, merged):
+    _, learner = make(demos, logit="f", grouping=grouping, penalty="irmv1")
+    batch = a_batch(observations=8, actions=4)
+    weights = torch.full((2,), 0.5)
+    found = discriminator.minibatch_loss(
+        learner.model, batch, None, weights, learner.config, 1.0, torch.Generator()
+    )
+    logits, f = discriminator.discriminator_logits(learner.model, batch, "f")
+    options = PenaltyOptions(learner.config.penalty_scaling, True, 1.0)
+    one, other = (
+        discriminator.discriminator_loss(logits, f, weights, m, "irmv1", options).penalty.item()
+        for m in (merged, not merged)
+    )
+    assert found.penalty.item() == pytest.approx(one) != pytest.approx(other)
+
+
 def test_a_linear_schedule_ends_at_zero(demos):
     trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, learning_rate_schedule="linear")
     (rollout,) = trainer.train_round(0, learner)

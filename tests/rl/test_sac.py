@@ -95,6 +95,19 @@ def test_sampled_rewards_are_in_units_of_the_deviation_of_their_discounted_sums(
     assert np.abs(sampled).max() == pytest.approx(np.abs(raw / raw.std()).max(), rel=1e-3)
 
 
+def test_discounted_sums_of_rewards_end_with_their_episode():
+    """The arm's by their limit of 150 steps."""
+    trainer = make_trainer(gamma=0.9, buffer_size=1000)
+    rollouts = trainer.train_round(0, Reward(lambda r: 1000.0 * r.observations[..., 0]))
+    raw = np.concatenate([r.observations[..., 0] for r in rollouts]) * 1000.0
+    sums = raw.copy()
+    for t in range(1, len(sums)):
+        if t != 150:
+            sums[t] += 0.9 * sums[t - 1]
+    sampled = trainer.model.replay_buffer.sample(2000).rewards.numpy()
+    assert np.abs(sampled).max() == pytest.approx(np.abs(raw).max() / sums.std(), rel=1e-3)
+
+
 def test_the_networks_share_the_moments_of_all_observations():
     trainer = make_trainer()
     rollouts = trainer.train_round(0, TrueReward())

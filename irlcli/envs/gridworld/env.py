@@ -245,7 +245,13 @@ class Gridworld(gymnasium.Env[np.ndarray, np.int64]):
         return self._observations[self._state].copy(), {}
 
     def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One move: observation [2] float32, true reward, terminated, truncated (never), info."""
+        """One move: observation [2] float32, true reward, terminated, truncated (never), info.
+
+        Raises:
+            ValueError: ``action`` is not 0, 1, 2 or 3.
+        """
+        if not self.action_space.contains(action):
+            raise ValueError(f"action must be 0, 1, 2 or 3, not {action!r}")
         reward = float(self.mdp.reward[self._state])
         after = self.mdp.afterstate[int(action), self._state]
         chances = self.mdp.probability[after]

@@ -14,6 +14,8 @@ import numpy as np
 from gymnasium.envs.box2d import lunar_lander as original
 from gymnasium.utils import EzPickle
 
+from irlcli.envs.checks import require
+
 
 def _bind(function: Callable[..., Any], **constants: float) -> types.FunctionType:
     """A copy of ``function`` that sees other values for some of its module's constants.
@@ -37,9 +39,9 @@ class LunarLander(original.LunarLander):
     Args:
         bounce: coefficient of restitution of hull and legs, in [0, 1] (original: 0). Box2D
             treats contacts slower than 1 m/s as inelastic, whatever the restitution.
-        friction: friction coefficient of the moon, at least 0 (original: 0.1). Between two
-            touching bodies, Box2D uses sqrt(f1 * f2).
-        engine_power: multiplier of the main engine's impulse, above 0 (original: 1).
+        friction: friction coefficient of the moon, in [0, 10] (original: 0.1). Between two touching
+            bodies, Box2D uses sqrt(f1 * f2).
+        engine_power: multiplier of the main engine's impulse, in [0.05, 20] (original: 1).
         render_mode: ``None``, ``"human"`` or ``"rgb_array"``.
 
     Raises:
@@ -53,19 +55,14 @@ class LunarLander(original.LunarLander):
         engine_power: float = 1.0,
         render_mode: str | None = None,
     ):
-        if not 0.0 <= bounce <= 1.0:
-            raise ValueError(f"bounce must lie in [0, 1], not {bounce}")
-        if not (np.isfinite(friction) and friction >= 0.0):
-            raise ValueError(f"friction must be at least 0 and finite, not {friction}")
-        if not (np.isfinite(engine_power) and engine_power > 0.0):
-            raise ValueError(f"engine_power must be above 0 and finite, not {engine_power}")
+        self.bounce = require("bounce", bounce, 0.0, 1.0)
+        self.friction = require("friction", friction, 0.0, 10.0)
+        self.engine_power = require("engine_power", engine_power, 0.05, 20.0)
         super().__init__(render_mode=render_mode)
         EzPickle.__init__(self, bounce, friction, engine_power, render_mode)
-        self.bounce = bounce
-        self.friction = friction
-        self.engine_power = engine_power
         self._original_step = _bind(
-            original.LunarLander.step, MAIN_ENGINE_POWER=original.MAIN_ENGINE_POWER * engine_power
+            original.LunarLander.step,
+            MAIN_ENGINE_POWER=original.MAIN_ENGINE_POWER * self.engine_power,
         )
 
     def reset(

@@ -187,6 +187,8 @@ class HalfCheetah(Robot, HalfCheetahEnv):
     legs = ("bthigh", "fthigh")
 
     def _get_obs(self) -> np.ndarray:
+        if not self._exclude_current_positions_from_observation:
+            return super()._get_obs()
         # Without Gymnasium's copies, which this light robot would notice.
         return np.concatenate((self.data.qpos[1:], self.data.qvel))
 
