@@ -5,8 +5,6 @@ environment's file, its profile, ``--settings FILE``, ``--set``, flags. Environm
 not read, so equal configs give equal artefacts wherever they run.
 """
 
-import stat
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -14,6 +12,7 @@ from typing import Any, Literal, get_args, get_origin
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
+from irlcli.configs.documents import parse_toml, read_toml
 from irlcli.configs.relevance import check_registered
 from irlcli.configs.schema import (
     AIRLConfig,
@@ -28,9 +27,6 @@ from irlcli.interventions import Setting, knob_of, listed_settings, overlap
 
 PROFILES = ("smoke", "standard", "paper")
 
-# A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
-_MAX_TOML_BYTES = 64 << 10
-_MAX_TOML_LINE = 2000
 # Above it, a bound only keeps numbers finite: no hint for people.
 _MANY = 1e6
 # A name besides those of the environments: settings/control.toml has the positive controls.
@@ -231,36 +227,6 @@ def settings_directory() -> Path:
     return packaged if packaged.is_dir() else Path(__file__).parent.parent.parent / "settings"
 
 
-def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
-    """The TOML document in ``path``, which ``option`` named.
-
-    Raises:
-        UsageError: not a plain file, too large, malformed or unreadable.
-    """
-    try:
-        information = path.stat()
-        if not stat.S_ISREG(information.st_mode) and not stat.S_ISDIR(information.st_mode):
-            # Opening a named pipe would wait for a writer that never comes.
-            raise UsageError(f"{path} is not a plain file", f"name a TOML file with {option}")
-        if information.st_size > _MAX_TOML_BYTES:
-            raise ValueError(f"it is larger than {_MAX_TOML_BYTES >> 10} KiB")
-        return _parse_toml(path.read_text("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise UsageError(
-            f"{path} is not valid TOML: {error}", "see settings/ for examples"
-        ) from None
-    except OSError as error:
-        raise UsageError(
-            f"{path} cannot be read: {error.strerror}", f"name a TOML file with {option}"
-        ) from None
-
-
-def _parse_toml(text: str) -> dict[str, Any]:
-    if max(map(len, text.splitlines()), default=0) > _MAX_TOML_LINE:
-        raise ValueError(f"a line is longer than {_MAX_TOML_LINE} characters")
-    return tomllib.loads(text)
-
-
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """``base`` with the values of ``over``; a field that ``over`` unsets is left out."""
     merged = dict(base)
@@ -415,7 +381,7 @@ def _typed(text: str, kind: Any, field: str) -> Any:
     if text == "none" and (nothing := _nothing(kind)):
         return nothing[0]
     try:
-        value = _parse_toml(f"value = {text}")["value"]
+        value = parse_toml(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text
     try:

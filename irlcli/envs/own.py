@@ -17,12 +17,13 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from irlcli.configs.load import check_profile, read_toml
+from irlcli.configs.documents import converted, read_toml
+from irlcli.configs.load import check_profile
 from irlcli.configs.schema import Config
 from irlcli.envs.code import code_of
 from irlcli.envs.registry import BUILT_IN
 from irlcli.envs.spec import Code, EnvironmentSpec, Form, Knob, Own
-from irlcli.errors import NotFound, UsageError, of_types, suggest
+from irlcli.errors import NotFound, UsageError, suggest
 
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,39}"
 _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
@@ -31,6 +32,7 @@ _MAX_NUMBER = 1e300
 # every key.
 _PHYSICS = 2
 # What the column ``t`` of demonstrations holds.
+_EXAMPLES = "docs/own-environments.md"
 _Steps = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 _Number = Annotated[float, Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
@@ -178,7 +180,7 @@ def _checked(document: Mapping[str, Any]) -> tuple[_Env, dict[str, _Knob]]:
         check_profile(profile, f"profiles.{profile}")
     if "env" not in document:
         raise UsageError("the section [env] is missing", 'write [env] with id = "module:EnvId"')
-    env = _converted(_table(document, "env"), _Env, "env")
+    env = converted(_table(document, "env"), _Env, "env", _EXAMPLES)
     if (env.id is None) == (env.entry_point is None):
         raise UsageError(
             "env.id and env.entry_point both name the environment"
@@ -211,7 +213,7 @@ def _knob(name: str, value: Any) -> _Knob:
             f"knobs.{name!r} cannot be the name of a knob",
             "up to 40 letters, digits, '-' and '_', a letter first",
         )
-    knob = _converted(value, _Knob, f"knobs.{name}")
+    knob = converted(value, _Knob, f"knobs.{name}", _EXAMPLES)
     if not knob.argument.isidentifier():
         raise UsageError(
             f"knobs.{name}.argument: {knob.argument!r} is not a keyword argument",
@@ -266,28 +268,6 @@ def _table(document: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise UsageError(f"{name}: expected a table, found {value!r}", f"write [{name}]")
     return value
-
-
-def _converted(value: Any, form: Any, where: str) -> Any:
-    """``value`` as a ``form``; a wrong one is named by its field."""
-    fields = form.__struct_fields__
-    if not isinstance(value, Mapping):
-        raise UsageError(f"{where}: expected a table, found {value!r}", f"write [{where}]")
-    for name in value:
-        if name not in fields:
-            raise UsageError(f"unknown field {f'{where}.{name}'!r}", suggest(name, fields))
-    try:
-        return msgspec.convert(value, form)
-    except msgspec.ValidationError as error:
-        message, _, place = str(error).partition(" - at ")
-        field = place.strip("`").removeprefix("$").lstrip(".")
-        missing = re.search(r"missing required field `(\w+)`", message)
-        if missing:
-            raise UsageError(f"{where}.{missing[1]} is missing", f"write it in [{where}]") from None
-        raise UsageError(
-            f"{where}{f'.{field}' if field else ''}: {of_types(message)}",
-            "see docs/own-environments.md",
-        ) from None
 
 
 def check_code(spec: EnvironmentSpec) -> None:

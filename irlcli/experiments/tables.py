@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
-from irlcli.configs.load import load_config, read_toml, settings_directory
+from irlcli.configs.documents import converted, read_toml
+from irlcli.configs.fields import Count, NonNegative, NonNegativeCount
+from irlcli.configs.load import load_config, settings_directory
 from irlcli.envs.announced import announced
 from irlcli.envs.registry import ENVIRONMENTS, environment, is_known, resolve
 from irlcli.envs.spec import EnvironmentSpec
@@ -27,7 +30,7 @@ REPORTS = {
     "returns": "True returns of evaluations",
     "table2": "Table 2: the values of the interventions",
 }
-_LARGEST = 1e300
+_EXAMPLES = "settings/experiments.toml"
 # What every comparison lists, or a file's defaults.
 _COMPARING = ("rows", "methods", "seeds", "measures")
 # What a method has that learns no reward.
@@ -42,6 +45,29 @@ class Row(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         return f"{self.env}.{self.knob}"
+
+
+class _Listed(msgspec.Struct, frozen=True, kw_only=True):
+    """A table as a file lists it, see :class:`Table`. Lists of a comparison are checked by name."""
+
+    title: str | UnsetType = UNSET
+    kind: str = "comparison"
+    rows: tuple[str, ...] | UnsetType = UNSET
+    methods: tuple[str, ...] | UnsetType = UNSET
+    seeds: tuple[NonNegativeCount, ...] | UnsetType = UNSET
+    measures: tuple[str, ...] | UnsetType = UNSET
+    retrainings: Count | UnsetType = UNSET
+    variants: dict[str, tuple[str, ...]] | UnsetType = UNSET
+    base: str | UnsetType = UNSET
+    penalty_weights: dict[str, NonNegative] | UnsetType = UNSET
+    settings: str | UnsetType = UNSET
+
+
+class _Defaults(msgspec.Struct, frozen=True, kw_only=True):
+    """What a file's tables have unless they list their own."""
+
+    methods: tuple[str, ...] | UnsetType = UNSET
+    seeds: tuple[NonNegativeCount, ...] | UnsetType = UNSET
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True):
@@ -97,9 +123,8 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
         tree = read_toml(path)
     except UsageError as error:
         raise UsageError(error.message, f"see {default_file()} for an example") from None
-    defaults = tree.pop(_DEFAULTS, {})
     try:
-        _check_fields(defaults, _DEFAULTS, ("methods", "seeds"))
+        defaults = converted(tree.pop(_DEFAULTS, {}), _Defaults, _DEFAULTS, _EXAMPLES)
         tables = {name: _table(name, value, defaults, path.parent) for name, value in tree.items()}
         _check_names(tables.values())
         return tables
@@ -210,7 +235,7 @@ def _rows_of(*environments: EnvironmentSpec) -> tuple[Row, ...]:
     )
 
 
-def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) -> Table:
+def _table(name: str, value: Any, defaults: _Defaults, directory: Path) -> Table:
     if not re.fullmatch(_NAME, name):
         raise UsageError(
             f"{name!r} cannot be the name of a table",
@@ -218,78 +243,79 @@ def _table(name: str, value: Any, defaults: Mapping[str, Any], directory: Path) 
         )
     if name in REPORTS:
         raise UsageError(f"{name!r} is a report of its own", "give the table another name")
-    fields = [*(f for f in Table.__struct_fields__ if f != "name"), "base"]
-    _check_fields(value, name, fields)
-    kind = _one_of(f"{name}.kind", value.get("kind", "comparison"), get_args(Kind))
-    title = _text(f"{name}.title", value.get("title", name))
-    settings = None
-    if "settings" in value:
-        settings = directory / _text(f"{name}.settings", value["settings"])
-        if not settings.is_file():
-            raise UsageError(
-                f"{name}.settings: {settings} is not a file", f"a path relative to {directory}"
-            )
+    listed = converted(value, _Listed, name, _EXAMPLES)
+    title = name if listed.title is UNSET else listed.title
+    if not title.isprintable():
+        raise UsageError(
+            f"{name}.title: {title!r} has control characters", "write one line of text"
+        )
+    settings = None if listed.settings is UNSET else directory / listed.settings
+    if settings is not None and not settings.is_file():
+        raise UsageError(
+            f"{name}.settings: {settings} is not a file", f"a path relative to {directory}"
+        )
+    kind = _one_of(f"{name}.kind", listed.kind, get_args(Kind))
+    table = Table(name=name, title=title, kind=kind, settings=settings)
     if kind != "comparison":
         for field in (*_COMPARING, "retrainings", "variants", "base", "penalty_weights"):
-            if field in value:
+            if getattr(listed, field) is not UNSET:
                 raise UsageError(f"{name}.{field}: kind {kind!r} has no {field}", f"omit {field}")
-        return Table(name=name, title=title, kind=kind, settings=settings)
-    filled = {**defaults, **value}
+        return table
+    given = {f: v for f, v in msgspec.structs.asdict(listed).items() if v is not UNSET}
+    filled = msgspec.structs.replace(listed, **(msgspec.structs.asdict(defaults) | given))
     for field in _COMPARING:
-        if field not in filled:
-            raise UsageError(f"{name}.{field} is missing", f"fields: {', '.join(fields)}")
-        _check_is_list(f"{name}.{field}", filled[field])
-    table = Table(name=name, title=title, kind=kind, settings=settings)
+        if getattr(filled, field) is UNSET:
+            fields = ", ".join(_Listed.__struct_fields__)
+            raise UsageError(f"{name}.{field} is missing", f"fields: {fields}")
     return msgspec.structs.replace(table, **_comparison(name, filled, directory))
 
 
-def _comparison(name: str, filled: Mapping[str, Any], directory: Path) -> dict[str, Any]:
+def _comparison(name: str, filled: _Listed, directory: Path) -> dict[str, Any]:
     """The fields of a table that compares methods or variants."""
-    _check_list(f"{name}.measures", filled["measures"], MEASURES)
-    rows = [_row(f"{name}.rows", text, directory, filled["measures"]) for text in filled["rows"]]
+    methods, seeds, measures = filled.methods or (), filled.seeds or (), filled.measures or ()
+    _check_list(f"{name}.measures", measures, MEASURES)
+    rows = [_row(f"{name}.rows", text, directory, measures) for text in filled.rows or ()]
     _check_list(f"{name}.rows", rows)
-    _check_list(f"{name}.methods", filled["methods"], METHODS)
-    _check_rewards(f"{name}.methods", filled["methods"], filled["measures"])
-    if set(filled["measures"]) <= {ASSESS, CUE}:
+    _check_list(f"{name}.methods", methods, METHODS)
+    _check_rewards(f"{name}.methods", methods, measures)
+    if set(measures) <= {ASSESS, CUE}:
         raise UsageError(
-            f"{name}.measures: {' and '.join(filled['measures'])} alone fills no cell of a table",
+            f"{name}.measures: {' and '.join(measures)} alone fills no cell of a table",
             "add transfer, zero-shot or id",
         )
-    for seed in filled["seeds"]:
-        if type(seed) is not int or seed < 0:
-            raise UsageError(f"{name}.seeds: {seed!r} is not a seed", "a whole number from 0")
-    _check_list(f"{name}.seeds", filled["seeds"])
-    retrainings = filled.get("retrainings", 1)
-    if type(retrainings) is not int or retrainings < 1:
-        raise UsageError(
-            f"{name}.retrainings: {retrainings!r} is not a count", "a whole number from 1"
-        )
+    _check_list(f"{name}.seeds", seeds)
+    weights = filled.penalty_weights or {}
+    penalised = [method for method in METHODS if METHODS[method].penalty != "none"]
+    for method in weights:
+        _one_of(f"{name}.penalty_weights", method, penalised)
     return {
         "rows": tuple(rows),
-        "methods": tuple(filled["methods"]),
-        "seeds": tuple(filled["seeds"]),
-        "measures": tuple(filled["measures"]),
-        "retrainings": retrainings,
-        "variants": _variants(name, filled),
-        "penalty_weights": _weights(f"{name}.penalty_weights", filled.get("penalty_weights", {})),
+        "methods": methods,
+        "seeds": seeds,
+        "measures": measures,
+        "retrainings": filled.retrainings or 1,
+        "variants": _variants(name, filled, methods, measures),
+        "penalty_weights": weights,
     }
 
 
-def _variants(name: str, filled: Mapping[str, Any]) -> tuple[Variant, ...]:
-    if "variants" not in filled:
-        if "base" in filled:
+def _variants(
+    name: str, filled: _Listed, methods: Sequence[str], measures: Sequence[str]
+) -> tuple[Variant, ...]:
+    if filled.variants is UNSET:
+        if filled.base is not UNSET:
             raise UsageError(
                 f"{name}.base: {name} has no variants", f"add [{name}.variants], or omit base"
             )
         return ()
-    variants = read_variants(f"{name}.variants", filled["variants"], filled.get("base"))
-    _check_single(f"{name}.methods", filled["methods"])
-    if "transfer-id" not in filled["measures"]:
+    variants = read_variants(f"{name}.variants", filled.variants, filled.base or None)
+    _check_single(f"{name}.methods", methods)
+    if "transfer-id" not in measures:
         raise UsageError(
             f"{name}.measures: variants are compared by policies retrained in distribution",
             "add transfer-id",
         )
-    if "penalty_weights" in filled:
+    if filled.penalty_weights is not UNSET:
         raise UsageError(
             f"{name}.penalty_weights: a table of variants has one method",
             f"omit it, and write airl.penalty_weight=VALUE in {name}.variants",
@@ -297,24 +323,9 @@ def _variants(name: str, filled: Mapping[str, Any]) -> tuple[Variant, ...]:
     return variants
 
 
-def _weights(field: str, value: Any) -> Mapping[str, float]:
-    """lambda by method."""
-    if not isinstance(value, Mapping):
-        raise UsageError(f"{field}: {value!r} is not a table", "write { METHOD = LAMBDA }")
-    penalised = [name for name, method in METHODS.items() if method.penalty != "none"]
-    for name, weight in value.items():
-        _one_of(field, name, penalised)
-        if type(weight) not in (int, float) or not 0.0 <= weight <= _LARGEST:
-            raise UsageError(
-                f"{field}: {weight!r} is no lambda of {name}", "a finite number from 0 up"
-            )
-    return {name: float(weight) for name, weight in value.items()}
-
-
-def _row(field: str, text: Any, directory: Path, measures: Sequence[str]) -> Row:
+def _row(field: str, text: str, directory: Path, measures: Sequence[str]) -> Row:
     """A row such as ``ant.mass``, or ``hopper.toml.mass`` with a file beside the table's."""
-    named = _text(field, text)
-    env, _, knob = named.rpartition(".") if ".toml." in named else named.partition(".")
+    env, _, knob = text.rpartition(".") if ".toml." in text else text.partition(".")
     try:
         spec = resolve(str(directory / env)) if env.endswith(".toml") else _named(env, text)
         has_cue = knob_of(spec.name, knob).cue is not None
@@ -344,19 +355,6 @@ def _named(env: str, text: str) -> EnvironmentSpec:
         f"{hint}write ENVIRONMENT.INTERVENTION, with one of: {', '.join(e.name for e in fit)}, or "
         "a TOML file that describes one",
     )
-
-
-def _check_fields(value: Any, name: str, fields: Sequence[str]) -> None:
-    if not isinstance(value, Mapping):
-        raise UsageError(f"{name} is not a table", f"write [{name}] with: {', '.join(fields)}")
-    for field in value:
-        if field not in fields:
-            raise UsageError(f"{name} has no field {field!r}", suggest(field, fields))
-
-
-def _check_is_list(field: str, value: Any) -> None:
-    if not isinstance(value, list):
-        raise UsageError(f"{field}: {value!r} is not a list", "write [..., ...]")
 
 
 def _check_list(field: str, values: Sequence[Any], known: Mapping | Sequence | None = None) -> None:
@@ -389,10 +387,4 @@ def _check_rewards(field: str, methods: Sequence[str], measures: Sequence[str]) 
 def _one_of(field: str, value: Any, known: Sequence[str]) -> Any:
     if value not in known:
         raise UsageError(f"{field}: unknown {value!r}", suggest(str(value), known))
-    return value
-
-
-def _text(field: str, value: Any) -> str:
-    if not isinstance(value, str) or not value.isprintable():
-        raise UsageError(f"{field}: {value!r} is not text", "write it in quotes")
     return value

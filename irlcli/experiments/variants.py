@@ -24,16 +24,18 @@ Configs = Callable[[str, Mapping[str, Any] | None], Config]
 Overridable = Callable[[str, Mapping[str, Any] | None, Sequence[str]], Config]
 
 
-def read_variants(field: str, value: Any, base: Any) -> tuple[Variant, ...]:
+def read_variants(
+    field: str, value: Mapping[str, Sequence[str]], base: str | None
+) -> tuple[Variant, ...]:
     """The variants in a table's ``field``, that called ``base`` first.
 
     Raises:
-        UsageError: no table of lists; a name that is no variant's; an unknown field or value, or
-            a field that no variant may change; two variants with equal overrides; an unknown base.
+        UsageError: fewer than two; a name that is no variant's; an unknown field or value, or a
+            field that no variant may change; two variants with equal overrides; an unknown base.
     """
-    if not isinstance(value, Mapping) or len(value) < 2:
+    if len(value) < 2:
         raise UsageError(
-            f"{field} is not a table of at least two variants",
+            f"{field} has fewer than two variants",
             f'write [{field}] with lines such as "no ceiling" = ["transfer.ceiling=none"]',
         )
     found: dict[str, tuple[Variant, dict[str, Any]]] = {}
@@ -54,27 +56,26 @@ def read_variants(field: str, value: Any, base: Any) -> tuple[Variant, ...]:
                     f"{field}: {name!r} and {other!r} have the same overrides", "omit one of them"
                 )
         found[name] = variant, changed
+    if base is None:
+        raise UsageError(
+            f"{field.rpartition('.')[0]}.base is missing", f"one of: {', '.join(found)}"
+        )
     if base not in found:
         raise UsageError(
             f"{field.rpartition('.')[0]}.base: {base!r} is not a variant",
-            suggest(str(base), found),
+            suggest(base, found),
         )
     variants = [variant for variant, _ in found.values()]
     return tuple(sorted(variants, key=lambda variant: variant.name != base))
 
 
-def _variant(field: str, name: str, overrides: Any) -> Variant:
+def _variant(field: str, name: str, overrides: Sequence[str]) -> Variant:
     taken = (*METHODS, *BASELINES)
     if not re.fullmatch(_NAME, name) or len(name) > _LONGEST or name in taken:
         raise UsageError(
             f"{field} cannot be the name of a variant",
             f"up to {_LONGEST} lowercase letters, digits, single spaces and '-', and not "
             f"{', '.join(taken)}",
-        )
-    if not isinstance(overrides, list) or not all(isinstance(item, str) for item in overrides):
-        raise UsageError(
-            f"{field}: {overrides!r} is not a list of overrides",
-            'write ["FIELD=VALUE", ...], or [] for the settings as they are',
         )
     return Variant(name, tuple(overrides))
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from irlcli.configs.load import in_profile, read_toml
+from irlcli.configs.documents import read_toml
+from irlcli.configs.load import in_profile
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
 from irlcli.requests.overrides import replaced, unread

@@ -1,0 +1,89 @@
+"""TOML documents, read and converted with errors that name the file or the field."""
+
+import re
+import stat
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from irlcli.errors import UsageError, of_types, suggest
+
+# A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
+_MAX_TOML_BYTES = 64 << 10
+_MAX_TOML_LINE = 2000
+Form = TypeVar("Form", bound=msgspec.Struct)
+
+
+def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
+    """The TOML document in ``path``, which ``option`` named.
+
+    Raises:
+        UsageError: not a plain file, too large, malformed or unreadable.
+    """
+    try:
+        information = path.stat()
+        if not stat.S_ISREG(information.st_mode) and not stat.S_ISDIR(information.st_mode):
+            # Opening a named pipe would wait for a writer that never comes.
+            raise UsageError(f"{path} is not a plain file", f"name a TOML file with {option}")
+        if information.st_size > _MAX_TOML_BYTES:
+            raise ValueError(f"it is larger than {_MAX_TOML_BYTES >> 10} KiB")
+        return parse_toml(path.read_text("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UsageError(
+            f"{path} is not valid TOML: {error}", "see settings/ for examples"
+        ) from None
+    except OSError as error:
+        raise UsageError(
+            f"{path} cannot be read: {error.strerror}", f"name a TOML file with {option}"
+        ) from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The TOML document ``text``.
+
+    Raises:
+        ValueError: malformed, or a line is too long.
+    """
+    if max(map(len, text.splitlines()), default=0) > _MAX_TOML_LINE:
+        raise ValueError(f"a line is longer than {_MAX_TOML_LINE} characters")
+    return tomllib.loads(text)
+
+
+def converted(value: Any, form: type[Form], where: str, examples: str) -> Form:
+    """``value``, the table ``where`` of a document, as a ``form``.
+
+    Raises:
+        UsageError: no table, or an unknown, missing or wrong field; names it. For a wrong one the
+            hint names ``examples``.
+    """
+    fields = form.__struct_fields__
+    if not isinstance(value, Mapping):
+        raise UsageError(f"{where}: expected a table, found {value!r}", f"write [{where}]")
+    for name in value:
+        if name not in fields:
+            raise UsageError(f"unknown field {f'{where}.{name}'!r}", suggest(name, fields))
+    try:
+        return msgspec.convert(value, form)
+    except msgspec.ValidationError as error:
+        message, _, place = str(error).partition(" - at ")
+        field = _with_key(value, form, place.strip("`").removeprefix("$").lstrip("."))
+        missing = re.search(r"missing required field `(\w+)`", message)
+        if missing:
+            raise UsageError(f"{where}.{missing[1]} is missing", f"write it in [{where}]") from None
+        raise UsageError(
+            f"{where}{f'.{field}' if field else ''}: {of_types(message)}", f"see {examples}"
+        ) from None
+
+
+def _with_key(value: Mapping[str, Any], form: type[Form], field: str) -> str:
+    """``field`` of an error with the key of its dictionary, for which msgspec writes ``[...]``."""
+    name, inside, rest = field.partition("[...]")
+    for key in value[name] if inside else ():
+        try:
+            msgspec.convert({name: {key: value[name][key]}}, form)
+        except msgspec.ValidationError:
+            return f"{name}.{key}{rest}"
+    return field
