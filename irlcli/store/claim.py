@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import Busy
-from irlcli.store.durable import alive, unique_name
+from irlcli.store.durable import alive, machine, unique_name
 
 HEARTBEAT_SECONDS = 20.0
 # NFS clients may show times that are 60 s old, so a live claim can look 80 s old.
@@ -28,10 +28,20 @@ _POLL_SECONDS = 2.0
 _READER = ".reader"
 
 
+class _Said(NamedTuple):
+    """What a claim says of its holder; nothing, if it cannot be read."""
+
+    host: str = ""
+    machine: str = ""
+    process: int = 0
+    token: str = ""
+
+
 class Holder(NamedTuple):
     """Who wrote a claim, and how long ago it was touched [s]."""
 
     host: str
+    machine: str
     process: int
     token: str
     age: float
@@ -41,7 +51,7 @@ class Holder(NamedTuple):
 
     def lives(self, locks_work: bool) -> bool:
         """Whether it is at work. Where locks work, the caller holds the lock of this machine."""
-        if self.host == os.uname().nodename and (locks_work or not alive(self.process)):
+        if self.machine == machine() and (locks_work or not alive(self.process)):
             return False
         return self.age < STALE_SECONDS
 
@@ -142,17 +152,17 @@ def read(path: Path) -> Holder | None:
     found = _content(path)
     if found is None:
         return None
-    (host, process, token), touched = found
-    return Holder(host, process, token, _now(path.parent) - touched)
+    said, touched = found
+    return Holder(*said, _now(path.parent) - touched)
 
 
 def _token(path: Path) -> str | None:
     found = _content(path)
-    return None if found is None else found[0][2]
+    return None if found is None else found[0].token
 
 
-def _content(path: Path) -> tuple[tuple[str, int, str], float] | None:
-    """Host, process and token of a claim, and when it was touched [s]; None without a claim."""
+def _content(path: Path) -> tuple[_Said, float] | None:
+    """What a claim says, and when it was touched [s]; None without a claim."""
     try:
         # Opened and not only looked up, so that a file system of the network asks its server.
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -160,16 +170,17 @@ def _content(path: Path) -> tuple[tuple[str, int, str], float] | None:
         return None
     except OSError:
         # A link, for example: no claim, and to be removed.
-        return ("", 0, ""), 0.0
+        return _Said(), 0.0
     with open(descriptor, "rb") as file:
         touched = os.fstat(descriptor).st_mtime
         text = file.read(1000)
     try:
         said = json.loads(text)
-        return (str(said["host"]), int(said["process"]), str(said["token"])), touched
+        host, where, token = (str(said[field]) for field in ("host", "machine", "token"))
+        return _Said(host, where, int(said["process"]), token), touched
     except (ValueError, KeyError, TypeError):
         # It is being written, or the disk was full.
-        return ("", 0, ""), touched
+        return _Said(), touched
 
 
 def _now(directory: Path) -> float:
@@ -187,12 +198,12 @@ def _now(directory: Path) -> float:
 
 def _create(path: Path, token: str) -> bool:
     """Create the claim; False if it exists. True also where it cannot be written at all."""
-    claim = {"host": os.uname().nodename, "process": os.getpid(), "token": token}
+    said = _Said(os.uname().nodename, machine(), os.getpid(), token)
     # Linked when it is whole: the holder of an empty claim is unknown, and lives until it is stale.
     whole = path.with_name(unique_name(f".{path.name}"))
     try:
         with open(whole, "x") as file, suppress(OSError):
-            file.write(json.dumps(claim))
+            file.write(json.dumps(said._asdict()))
         os.link(whole, path)
     except FileExistsError:
         return False

@@ -1,11 +1,15 @@
 """Writing files so that a crash leaves the old content or the new, never a part."""
 
+import functools
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_DAY_SECONDS = 86400.0
 
 
 def fsync_file(path: Path) -> None:
@@ -48,17 +52,35 @@ def temporary_file(path: Path, data: bytes) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@functools.cache
+def machine() -> str:
+    """Where process ids have the meaning that they have here.
+
+    Containers and cloned machines may share a host name but neither boot nor process namespace.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{os.uname().nodename}-{boot[:8]}-{os.stat('/proc/self/ns/pid').st_ino}"
+    except OSError:
+        return os.uname().nodename
+
+
 def unique_name(stem: str) -> str:
     """A file name that no other process uses and that identifies this one."""
-    return f"{stem}.{os.getpid()}.{os.urandom(16).hex()}.{os.uname().nodename}"
+    return f"{stem}.{os.getpid()}.{os.urandom(16).hex()}.{machine()}"
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove the files that dead processes of this machine left in ``directory``."""
-    node = re.escape(os.uname().nodename)
+    """Remove what dead processes left in ``directory``: those of other machines after a day."""
     for path in directory.iterdir():
-        owner = re.fullmatch(rf".+\.(\d{{1,9}})\.[0-9a-f]{{32}}\.{node}", path.name)
-        if owner and not alive(int(owner[1])):
+        owner = re.fullmatch(r".+\.(\d{1,9})\.[0-9a-f]{32}\.(.+)", path.name)
+        if owner is None:
+            continue
+        try:
+            old = path.lstat().st_mtime < time.time() - _DAY_SECONDS
+        except FileNotFoundError:
+            continue
+        if not alive(int(owner[1])) if owner[2] == machine() else old:
             remove(path)
 
 

@@ -13,7 +13,7 @@ from irlcli.experiments import provenance
 from irlcli.stages import train_maxent, transfer
 from irlcli.stages.base import Stage
 from irlcli.store import Store
-from irlcli.store.durable import remove
+from irlcli.store.durable import machine, remove
 
 
 def test_checkpoints_of_another_stage_are_not_used():
@@ -138,7 +138,7 @@ def endless_checkpoint(store, key, outside):
 
 
 def odd_leftovers(store, key, outside):
-    node = os.uname().nodename
+    node = machine()
     (store.root / ".work" / key).mkdir()
     for pid in ("x", "9" * 40):
         (store.root / ".work" / key / f"out.{pid}.{'0' * 32}.{node}").mkdir()

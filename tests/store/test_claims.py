@@ -14,15 +14,16 @@ import time
 import pytest
 
 from irlcli.errors import Busy
-from irlcli.store import Store, claim
+from irlcli.store import Store, claim, durable
 from irlcli.store import store as store_module
 
 KEY = "0" * 64
 
 
-def foreign(path, seconds_ago=0.0, host="another-node", process=1):
+def foreign(path, seconds_ago=0.0, host="another-node", machine="another", process=1):
     """A claim as another machine writes it."""
-    path.write_text(json.dumps({"host": host, "process": process, "token": "t"}))
+    said = {"host": host, "machine": machine, "process": process, "token": "t"}
+    path.write_text(json.dumps(said))
     os.utime(path, (time.time() - seconds_ago,) * 2)
     return path
 
@@ -57,8 +58,25 @@ def test_a_claim_without_a_heartbeat_is_taken_over(empty_store, claims):
 
 
 def test_a_dead_process_of_this_machine_is_replaced_at_once(empty_store, claims):
-    foreign(claims / f"{KEY}.claim", host=os.uname().nodename, process=2**22 + 1)
+    foreign(claims / f"{KEY}.claim", machine=durable.machine(), process=2**22 + 1)
     work(empty_store)
+
+
+def test_a_container_with_the_same_host_name_is_another_machine(empty_store, claims):
+    """Its processes are not seen here."""
+    foreign(claims / f"{KEY}.claim", host=os.uname().nodename, process=2**22 + 1)
+    with pytest.raises(Busy):
+        work(empty_store)
+
+
+def test_what_other_machines_left_is_removed_after_a_day(empty_store, claims):
+    left = [claims / f".x.{2**22 + 1}.{i * 32}.{os.uname().nodename}-other" for i in "ab"]
+    for path in left:
+        path.touch()
+    yesterday = time.time() - 90000.0
+    os.utime(left[1], (yesterday, yesterday))
+    empty_store.collect(0.0)
+    assert [path.exists() for path in left] == [True, False]
 
 
 def test_waiting_ends_when_the_claim_ends(empty_store, claims, monkeypatch):
