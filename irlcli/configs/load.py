@@ -165,7 +165,7 @@ def _stack(env: str, layers: Layers) -> Config:
 
 def _with_sections(knob: str, listed: InterventionConfig, layers: Layers) -> InterventionConfig:
     """``listed`` with the whole config of each section that the knob has different."""
-    whole: dict[str, Any] = {}
+    whole: dict[str, Any] = {"episodes": _episodes(knob, layers)}
     if listed.expert is not None:
         whole["expert"] = msgspec.convert(_section("expert", layers, knob), ExpertConfig)
     if listed.transfer is not None:
@@ -173,6 +173,16 @@ def _with_sections(knob: str, listed: InterventionConfig, layers: Layers) -> Int
     if listed.airl is not None or listed.transfer is not None:
         whole["airl"] = _airl(layers, knob)
     return msgspec.structs.replace(listed, **whole)
+
+
+def _episodes(knob: str, layers: Layers) -> tuple[int, ...]:
+    """The knob's own counts of demonstrations, unless a later layer has one for all knobs."""
+    counts: Sequence[int] = ()
+    for _, values in layers:
+        if "episodes" in values.get("demonstrations", {}):
+            counts = ()
+        counts = values.get("interventions", {}).get(knob, {}).get("episodes", counts)
+    return tuple(counts)
 
 
 def _airl(layers: Layers, knob: str | None = None) -> AIRLConfig:

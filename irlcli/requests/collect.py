@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from irlcli.configs.load import field_of
 from irlcli.data.descriptions import Collected
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
@@ -44,6 +45,10 @@ def collect_experts(
     counts: Sequence[int] = ()
     if episodes is not None:
         counts = arguments.counts(episodes)
+        if any(field_of(item) == "demonstrations.episodes" for item in session.overrides):
+            raise UsageError(
+                "--episodes and --set demonstrations.episodes are both given", "omit one of them"
+            )
     elif listed is not None and not setting:
         counts = listed.episodes
     experts, normalisers = arguments.experts(session.store, env, expert)

@@ -16,7 +16,7 @@ _SECTIONS = {
     "assess": {"assessment"},
     "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
     "clone": {"airl.actions", "clone"},
-    "collect-experts": {"demonstrations", "expert", "gridworld"},
+    "collect-experts": {"demonstrations", "expert.bar"},
     "control-labels": {"control"},
     "control-maps": {"control"},
     "evaluate": {"evaluation"},
@@ -63,16 +63,21 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
             yield f"--set {item} has no effect: the other values make it {values}"
 
 
-def unread(overrides: Sequence[str], stages: Iterable[str]) -> Iterator[str]:
-    """The overrides whose field none of ``stages`` reads; none if one of them is not known here."""
-    names = {*stages}
-    if not names <= _SECTIONS.keys():
+def unread(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[str]:
+    """The overrides whose field none of ``requests`` reads; none if a stage is not known here."""
+    made = {(r.stage.name, hasattr(r.parameters, "gridworld")) for r in requests}
+    if not {name for name, _ in made} <= _SECTIONS.keys():
         return
-    read = set[str]().union(*(_SECTIONS[name] for name in names))
-    if "clone" in names:
-        from irlcli.stages.clone import Network
+    read = set[str]()
+    for name, tabular in made:
+        if (name, tabular) == ("collect-experts", True):
+            read |= {"demonstrations.episodes", "gridworld"}
+        else:
+            read |= _SECTIONS[name]
+        if name == "clone":
+            from irlcli.stages.clone import Network
 
-        read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
+            read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
     for item in overrides:
         field = field_of(item)
         if not any(f"{field}.".startswith(f"{part}.") for part in read):

@@ -224,9 +224,9 @@ class StageSession(Session):
         every = [made for request in (*self.prepared, *requests) for made in behind(request)]
         for line in replaced(self.asked, every):
             self.console.warn(line)
-        stages = {request.stage.name for request in every}
         # A bank is looked for under the whole config.
-        for item in () if "assess" in stages else unread(self.asked, stages):
+        whole = any(request.stage.name == "assess" for request in every)
+        for item in () if whole else unread(self.asked, every):
             self.console.warn(f"no stage of this command reads --set {item}")
 
 

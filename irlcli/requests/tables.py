@@ -165,7 +165,7 @@ def _warn_of_unread(session: StageSession, plan: "Plan") -> None:
     requests = [task.request for task in plan.tasks.values()]
     for line in replaced(session.overrides, requests):
         session.console.warn(line)
-    for item in unread(session.overrides, {request.stage.name for request in requests}):
+    for item in unread(session.overrides, requests):
         session.console.warn(f"no step of {plan.table.name} reads --set {item}")
 
 

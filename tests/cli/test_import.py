@@ -71,6 +71,7 @@ def test_a_round_trip_through_minari(irl, store_copy, minari):
     dataset = minari.load_dataset("me/lander-v0")
     recorded = read_demonstrations(Store(store_copy.path).resolve("demos").artefact.directory)
     assert dataset.total_episodes == sum(map(len, recorded.trajectories.values()))
+    assert "observations" in repr(dataset[0])
     assert dataset.env_spec.id == "irlcli/LunarLander-v0"
     assert "me" in minari.namespace.list_local_namespaces()
     about = list(dataset.storage.get_episode_metadata(range(dataset.total_episodes)))

@@ -592,3 +592,16 @@ def test_rewards_of_two_knobs_have_the_config_of_neither():
     for order in (settings, settings[::-1]):
         assert config.airl_of(order) == config.airl
     assert config.airl_of(settings[1:]) != config.airl
+
+
+def test_a_later_count_of_demonstrations_wins_over_a_knobs_own(tmp_path):
+    def counts(**options):
+        return load_config("ant", **options).interventions["goal-y"].episodes
+
+    assert (counts(), counts(profile="smoke")) == ((10, 3), (2, 1))
+    assert counts(overrides=["demonstrations.episodes=4"]) == ()
+    file = tmp_path / "mine.toml"
+    file.write_text("[demonstrations]\nepisodes = 4\n")
+    assert counts(file=file) == ()
+    file.write_text("[demonstrations]\nepisodes = 4\n[interventions.goal-y]\nepisodes = [5, 1]\n")
+    assert counts(file=file) == (5, 1)

@@ -248,6 +248,35 @@ def test_what_minari_holds_and_irl_cannot_use_is_named(tmp_path):
         imported(read_minari, tmp_path / "b", tmp_path / "out")
 
 
+@pytest.mark.parametrize("form", ["soft link", "external link", "external data", "virtual"])
+def test_numbers_outside_a_datasets_file_are_refused(tmp_path, form):
+    """The key of an import covers the file itself."""
+    import h5py
+
+    for name in ("a", "b"):
+        save_minari(tmp_path / name, [episode(np.random.default_rng(0), 3) for _ in range(2)])
+    imported(read_minari, tmp_path / "a", tmp_path / "out")
+    other = tmp_path / "b" / "main_data.hdf5"
+    (tmp_path / "numbers.bin").write_bytes(np.ones(3).tobytes())
+    with h5py.File(tmp_path / "a" / "main_data.hdf5", "a") as file:
+        if form == "external link":
+            del file["episode_1"]
+            file["episode_1"] = h5py.ExternalLink(other, "episode_1")
+        else:
+            del file["episode_1"]["rewards"]
+        if form == "soft link":
+            file["episode_1"]["rewards"] = h5py.SoftLink("/episode_0/rewards")
+        elif form == "external data":
+            outside = [(tmp_path / "numbers.bin", 0, h5py.h5f.UNLIMITED)]
+            file["episode_1"].create_dataset("rewards", (3,), float, external=outside)
+        elif form == "virtual":
+            virtual = h5py.VirtualLayout((3,), float)
+            virtual[:] = h5py.VirtualSource(other, "episode_1/rewards", (3,))
+            file["episode_1"].create_virtual_dataset("rewards", virtual)
+    with pytest.raises(IntegrityError, match="another file|is a link"):
+        imported(read_minari, tmp_path / "a", tmp_path / "out2")
+
+
 def test_an_episode_of_another_form_is_named(tmp_path):
     import h5py
 

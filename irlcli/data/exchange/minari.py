@@ -164,10 +164,13 @@ def _from_hdf5(path: Path, episodes: int, column: str | None) -> Iterator[_Episo
     wanted = ["seed", column or SETTING]
     with h5py.File(path, "r") as file:
         for number in range(episodes):
-            group = h5py.h5g.open(file.id, f"episode_{number}".encode())
+            group = _group(file, f"episode_{number}")
             arrays: dict[str, Any] = {}
             for name in _ARRAYS:
                 stored = h5py.h5d.open(group, name.encode())
+                layout = stored.get_create_plist()
+                if layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
+                    raise ValueError(f"{name} of episode {number} is stored in another file")
                 shape, kind = stored.shape, stored.dtype
                 if kind.kind not in "biuf" or not shape:
                     raise ValueError(f"{name} of episode {number} are not rows of numbers")
@@ -179,6 +182,25 @@ def _from_hdf5(path: Path, episodes: int, column: str | None) -> Iterator[_Episo
             # For the message, all of them.
             metadata = found if column in (*found, None) else dict(attributes)
             yield _Episode(**arrays, metadata=metadata)
+
+
+def _group(file: Any, name: str) -> Any:
+    """The group ``name`` of ``file``, which has all its numbers in ``file`` itself.
+
+    The key covers this file alone, so links to other files are refused.
+    """
+    import h5py
+
+    def check(parent: Any, link: str) -> None:
+        if parent.links.get_info(link.encode()).type != h5py.h5l.TYPE_HARD:
+            raise ValueError(f"{link} is a link")
+
+    root = h5py.h5g.open(file.id, b"/")
+    check(root, name)
+    group = h5py.h5g.open(root, name.encode())
+    for array in _ARRAYS:
+        check(group, array)
+    return group
 
 
 def _from_storage(storage: Any) -> Iterator[_Episode]:
@@ -233,6 +255,8 @@ def write_minari(
                 rewards=steps.rewards,
                 terminations=steps.terminated,
                 truncations=steps.truncated,
+                # Without it Minari cannot print the episode.
+                infos={},
             )
 
     storage = storage_class.new(
