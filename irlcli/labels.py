@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from irlcli.store import KeyRecord
 
 _MAX_LENGTH = 200
+_LARGEST = 2**53
 # Section and field of a stage's parameters, and what they count.
 _BUDGETS = (
     ("maxent", "iterations", "iterations"),
@@ -69,7 +70,7 @@ def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
 def budget(parameters: Mapping[str, Any]) -> str:
     """How long a stage trains or how much it measures, in which profiles differ; else empty."""
     for config in (parameters.get("airl"), parameters.get("transfer"), parameters):
-        if isinstance(config, dict) and isinstance(config.get("total_steps"), int):
+        if isinstance(config, dict) and _is_count(config.get("total_steps")):
             return f"{steps_of_all_restarts(config):,} steps"
     for section, field, unit in _BUDGETS:
         config = parameters.get(section) if section else parameters
@@ -77,7 +78,7 @@ def budget(parameters: Mapping[str, Any]) -> str:
         if found is None:
             continue
         counts = found if isinstance(found, list | tuple) else [found]
-        if counts and all(isinstance(count, int) for count in counts):
+        if counts and all(map(_is_count, counts)):
             return _joined([", ".join(f"{count:,}" for count in counts), unit])
     return ""
 
@@ -92,14 +93,16 @@ def steps(config: Mapping[str, Any], budget: int | None = None) -> int:
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         return total
     size = math.prod(sizes)
+    if not _is_count(size):
+        return total
     return -(-total // size) * size
 
 
 def steps_of_all_restarts(config: Mapping[str, Any]) -> int:
     """Environment steps of a training with ``config`` and of its restarts, if it has any."""
     restarts, each = config.get("restarts"), config.get("restart_steps")
-    others = restarts - 1 if isinstance(restarts, int) else 0
-    return steps(config) + others * steps(config, each if isinstance(each, int) else None)
+    others = restarts - 1 if isinstance(restarts, int) and _is_count(restarts) else 0
+    return steps(config) + others * steps(config, each if _is_count(each) else None)
 
 
 def learned(config: Mapping[str, Any]) -> str:
@@ -177,7 +180,14 @@ def _made(record: KeyRecord) -> list[Any]:
 
 
 def _number(value: Any) -> str:
+    if isinstance(value, int) and not _is_count(value):
+        return "?"
     return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def _is_count(value: Any) -> bool:
+    """Whether ``value`` is a whole number that a config may hold; a hostile file has any."""
+    return isinstance(value, int) and abs(value) <= _LARGEST
 
 
 def _joined(parts: Sequence[Any]) -> str:

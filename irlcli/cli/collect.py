@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from irlcli.cli.options import Name, OneSetting, RequiredEnv, stage_command
+from irlcli.cli.options import MAX_SEED, Name, OneSetting, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests import collect as requested
 
@@ -38,7 +38,11 @@ def collect_experts(
     ] = None,
     seed: Annotated[
         int,
-        typer.Option(min=0, help="Seed of the recorded episodes. The experts' seed is always 0."),
+        typer.Option(
+            min=0,
+            max=MAX_SEED,
+            help="Seed of the recorded episodes. The experts' seed is always 0.",
+        ),
     ] = 0,
     name: Name = None,
 ) -> None:

@@ -1,5 +1,6 @@
 """``irl export``."""
 
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -61,7 +62,7 @@ def _demos_to_minari(session: Session, ref: str, name: str) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
     directory = checked(session.store, source)
     dataset = references.minari_directory(name).parent
-    if dataset.exists():
+    if os.path.lexists(dataset):
         raise UsageError(f"Minari has a dataset {name!r} already", "raise its version: -v1")
     dataset.parent.mkdir(parents=True, exist_ok=True)
     with _new_file(session, dataset) as path:
@@ -103,7 +104,7 @@ def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
 
 
 def _new_file(session: Session, path: Path) -> AbstractContextManager[Path]:
-    if path.exists():
+    if os.path.lexists(path):
         raise UsageError(f"{path} exists", "name another file, or remove it first")
     return session.whole_file(path, "--to")
 

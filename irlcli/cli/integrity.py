@@ -75,6 +75,15 @@ def verify(
 
 def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> None:
     """Fail if a name points to nothing; warn if only an ancestor of a named artefact is missing."""
+    result["damaged_names"] = session.store.damaged_names()
+    if result["damaged_names"]:
+        raise _with_details(
+            IntegrityError(
+                f"damaged names: {', '.join(result['damaged_names'])}",
+                "name the artefacts again: `irl name REF NAME`",
+            ),
+            result,
+        )
     missing = session.store.missing(index)
     result["missing"] = {
         id16: {"names": lost.names, "made": lost.made, "command": lost.command or None}

@@ -1,6 +1,7 @@
 """What a command works with: a session of its options that prints what it finds and runs."""
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.cli import console as out
-from irlcli.errors import NotFound, UsageError
+from irlcli.errors import RETRY, NotFound, StageFailed, UsageError, first_line
 from irlcli.requests import session as base
 from irlcli.requests.session import DEFAULT_STORE
 from irlcli.store import Artefact
@@ -51,7 +52,8 @@ class Session(base.Session):
             )
         if path.is_dir():
             raise UsageError(f"{path} is a directory", f"name a file with {option}")
-        if path.resolve().is_relative_to(self.store.root.resolve()):
+        # Not Path.resolve, which raises where links form a circle.
+        if Path(os.path.realpath(path)).is_relative_to(os.path.realpath(self.store.root)):
             raise UsageError(f"{path} lies in the store", f"name another file with {option}")
 
     @contextmanager
@@ -71,10 +73,19 @@ class Session(base.Session):
                 f"{path} cannot be written: {error.strerror or error}",
                 f"name another file with {option}",
             ) from None
-        with scratch as directory:
-            part = Path(directory) / path.name
-            yield part
-            os.replace(part, path)
+        terminated = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        try:
+            with scratch as directory:
+                part = Path(directory) / path.name
+                yield part
+                os.replace(part, path)
+        except OSError as error:
+            if error.filename is not None:
+                raise
+            # PyArrow and HDF5 name no file where a disk is full.
+            raise StageFailed(f"{path} cannot be written: {first_line(error)}", RETRY) from None
+        finally:
+            signal.signal(signal.SIGTERM, terminated)
 
 
 class StageSession(base.StageSession):

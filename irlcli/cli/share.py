@@ -9,7 +9,14 @@ import typer
 from irlcli.cli import console as out
 from irlcli.cli.options import store_command
 from irlcli.cli.session import Session
-from irlcli.errors import IntegrityError, NewerFormat, NotFound, UsageError
+from irlcli.errors import (
+    IntegrityError,
+    NewerFormat,
+    NotFound,
+    StageFailed,
+    UsageError,
+    file_failure,
+)
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
@@ -41,7 +48,7 @@ def push(
     session.check_exists()
     place = open_place(to, session.console.warn)
     artefacts = _chosen(session.store, session.artefact, refs, everything)
-    _share(session, session.store, place, artefacts, f"push to {place.root}", quiet)
+    _share(session, session.store, place, artefacts, f"push to {place.root}", quiet, everything)
 
 
 @store_command
@@ -79,7 +86,7 @@ def pull(
     except IntegrityError as error:
         error.hint = _damaged_there(place)
         raise
-    _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet)
+    _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet, everything)
 
 
 def _chosen(
@@ -102,6 +109,7 @@ def _share(
     artefacts: list[Artefact],
     label: str,
     quiet: bool,
+    everything: bool,
 ) -> None:
     from irlcli.store.share import share
 
@@ -120,7 +128,12 @@ def _share(
         return advance
 
     try:
-        shared = share(source, target, artefacts, console.warn, start)
+        shared = share(source, target, artefacts, console.warn, start, partial=everything)
+    except OSError as error:
+        raise StageFailed(
+            f"{label}: {file_failure(error).message}",
+            "whole artefacts that were copied are kept; run the same command again for the others",
+        ) from None
     except IntegrityError as error:
         # The place to copy to can be at fault, too.
         if error.message.startswith(f"{source.root}/") and not isinstance(error, NewerFormat):

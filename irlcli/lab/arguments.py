@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import numbers
 import operator
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -33,17 +35,31 @@ class Configs(TypedDict, total=False):
     set: Overrides
 
 
-# Annotations of arguments that are text.
-_TEXT = ("str", "str | None")
+# What an annotation of an argument allows, and its name in an error. A bool is no number.
+_FORMS: dict[str, tuple[str, tuple[type, ...]]] = {
+    "str": ("text", (str,)),
+    "Path": ("a path", (os.PathLike,)),
+    "bool": ("True or False", (bool,)),
+    "int": ("a whole number", (numbers.Integral,)),
+    "float": ("a number", (numbers.Real,)),
+    "None": ("None", (type(None),)),
+    "Sequence": ("a list", (Sequence,)),
+    "Mapping": ("a dict", (Mapping,)),
+    "Overrides": ("a dict or a list", (Sequence, Mapping)),
+}
+
+
+_CONFIGS: Mapping[str, Any] = Configs.__annotations__
 
 
 def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
     """``method`` with errors that name arguments instead of options, and show no inner frames."""
     signature = inspect.signature(method)
     known = {*signature.parameters} - {"self"}
-    texts = [p.name for p in signature.parameters.values() if p.annotation in _TEXT]
+    forms = {p.name: _forms(str(p.annotation)) for p in signature.parameters.values()}
     if "configs" in known:
         known = {*known, *Configs.__annotations__} - {"configs"}
+        forms |= {name: _forms(kind.__forward_arg__) for name, kind in _CONFIGS.items()}
     shown = method.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @functools.wraps(method)
@@ -52,9 +68,9 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
         for name in kwargs.keys() - known:
             raise UsageError(f"{shown} has no argument {name!r}", suggest(name, known))
         given = signature.bind_partial(*args, **kwargs).arguments
-        for name in texts:
-            if not isinstance(value := given.get(name, ""), str | None):
-                raise UsageError(f"{name} {value!r} is not text", f'write {name}="{value}"')
+        configs = given.pop("configs", {})
+        for name, value in (given | configs).items():
+            _check_form(name, value, forms[name])
         try:
             return method(*args, **kwargs)
         except IrlError as error:
@@ -66,6 +82,24 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
             raise failed from None
 
     return call
+
+
+def _forms(annotation: str) -> list[str]:
+    """The names in ``annotation`` if all of them are known; none of another class."""
+    names = [part.partition("[")[0] for part in re.sub(r"\[.*?\]+", "[]", annotation).split(" | ")]
+    return names if _FORMS.keys() >= {*names} else []
+
+
+def _check_form(name: str, value: Any, forms: Sequence[str]) -> None:
+    allowed = tuple(kind for form in forms for kind in _FORMS[form][1])
+    if not forms or (
+        isinstance(value, allowed) and ("bool" in forms or not isinstance(value, bool))
+    ):
+        return
+    words = " or ".join(_FORMS[form][0] for form in forms if form != "None")
+    quoted = "str" in forms and isinstance(value, int | float)
+    hint = f'write {name}="{value}"' if quoted else f"give {words}"
+    raise UsageError(f"{name} {value!r} is not {words}", hint)
 
 
 def in_python(text: str) -> str:
@@ -103,7 +137,9 @@ def overrides(given: Overrides) -> list[str]:
     """As for ``--set``: each ``FIELD=VALUE``."""
     if isinstance(given, Mapping):
         return [f"{field}={_toml(value)}" for field, value in given.items()]
-    return listed(given)
+    for item in (items := listed(given)):
+        _check_form("set", item, ["str"])
+    return items
 
 
 def merged(first: Sequence[str], later: Sequence[str]) -> list[str]:
@@ -116,8 +152,13 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(json.dumps, value))}]"
+        return f"[{', '.join(map(_element, value))}]"
     return "none" if value is None else str(value)
+
+
+def _element(value: Any) -> str:
+    """``value`` in a list of TOML. A scalar of NumPy is the number that it holds."""
+    return json.dumps(value.item() if hasattr(value, "item") else value)
 
 
 def listed(given: Any) -> list[Any]:

@@ -17,6 +17,7 @@ from irlcli.interventions import (
     examples_of,
     knob_of,
     listed_settings,
+    overlap,
     parse_setting,
     parse_settings,
 )
@@ -137,8 +138,9 @@ def warn_of_seen(
     console: "RunConsole", settings: Sequence[Setting], origin: "Reward | Policy", ref: str
 ) -> None:
     """Warn of each ``--ood`` setting that ``origin``, which ``ref`` names, was trained in."""
+    trained = [parse_setting(origin.env, text) for text in origin.settings]
     for setting in settings:
-        if str(setting) in origin.settings:
+        if any(overlap(setting, other) for other in trained):
             console.warn(f"{setting} is not held out: {ref!r} was trained in it")
 
 

@@ -1,6 +1,7 @@
 """``collect-experts`` and ``import``: demonstrations."""
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from irlcli.configs.load import field_of
 from irlcli.data.descriptions import Collected
@@ -9,7 +10,7 @@ from irlcli.errors import UsageError
 from irlcli.experiments.references import output, recorded
 from irlcli.interventions import parse_setting, without_cue
 from irlcli.requests import arguments
-from irlcli.requests.session import StageSession
+from irlcli.requests.session import StageSession, check_path
 from irlcli.stages import collect_experts as collect_stage
 from irlcli.stages import import_demonstrations as import_stage
 from irlcli.stages.base import Request
@@ -92,6 +93,8 @@ def import_demonstrations(
             "give --intervention KNOB=VALUE,VALUE, or --setting default for the unchanged "
             "environment",
         )
+    for source in recordings:
+        check_path(Path(source), "SOURCE")
     env = resolve(env).name
     settings = arguments.where(None, intervention, setting).settings(env, session.config(env))
     form, found = recorded(recordings)

@@ -1,7 +1,6 @@
 """Garbage collection: names and their ancestors are kept, and whatever is young."""
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,7 +15,7 @@ from irlcli.store.integrity import quarantined
 from irlcli.store.layout import Layout, claims, make_directories
 from irlcli.store.lock import claim_of, exclusive, is_locked
 from irlcli.store.read import index as read_index
-from irlcli.store.references import names
+from irlcli.store.references import damaged_names, names
 
 
 class Missing(NamedTuple):
@@ -48,6 +47,8 @@ def garbage(layout: Layout, grace_seconds: float, warn: Callable[[str], None]) -
     Artefacts of a newer schema, and whatever their manifests mention, are never garbage.
     """
     index = read_index(layout, warn)
+    for name in damaged_names(layout):
+        warn(f"{layout.names / name} is damaged: gc does not know what the name protects")
     for id16, lost in missing(layout, index).items():
         warn(f"{lost.text(id16)}; gc cannot protect the inputs of {id16}")
     kept = index.reached_from(names(layout).values())
@@ -109,6 +110,7 @@ def collect(
 
     Raises:
         Busy: the store is in use.
+        IntegrityError: the file of a name is damaged, so that what it protected is not known.
     """
     if not layout.marker.exists():
         return [], []
@@ -117,6 +119,11 @@ def collect(
         reader = live_reader(layout.locks, locks_work=no_locks is None)
         if reader is not None:
             raise Busy(f"{reader} is working on the store {layout.root}", "try again later")
+        if damaged := damaged_names(layout):
+            raise IntegrityError(
+                f"{layout.names / damaged[0]} is damaged, so gc does not know what the name protects",
+                f"name the artefact again: `irl name REF {damaged[0]}`",
+            )
         artefacts, work = garbage(layout, grace_seconds, warn), stale_work(layout, grace_seconds)
         pointers: dict[str, list[Path]] = {}
         for pointer, id16 in claims(layout):
@@ -124,7 +131,8 @@ def collect(
         removed = []
         for artefact in artefacts:
             try:
-                artefact.directory.chmod(0o755)
+                if not artefact.directory.is_symlink():
+                    artefact.directory.chmod(0o755)
             except PermissionError:
                 warn(f"{artefact.directory} belongs to another user, who can remove it")
                 continue
@@ -134,7 +142,7 @@ def collect(
             # A unique name: an interrupted gc may have left an earlier, half-removed copy.
             grave = layout.work / f"removed-{artefact.id}-{os.urandom(4).hex()}"
             artefact.directory.rename(grave)
-            shutil.rmtree(grave)
+            remove(grave)
             removed.append(artefact)
         for path in work:
             remove(path)

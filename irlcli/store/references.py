@@ -164,6 +164,15 @@ def names(layout: Layout) -> dict[str, str]:
     return {name: id16 for name, id16 in found.items() if id16 is not None}
 
 
+def damaged_names(layout: Layout) -> list[str]:
+    """The names whose file does not contain an id."""
+    try:
+        entries = sorted(path.name for path in layout.names.iterdir())
+    except FileNotFoundError:
+        return []
+    return [name for name in entries if is_name(name) and named(layout, name) is None]
+
+
 def named(layout: Layout, name: str) -> str | None:
     """The id that ``name`` points to. Reads one file, however many names exist."""
     return pointed_to(layout.names / name) if is_name(name) else None
@@ -174,8 +183,13 @@ def check_name(name: str) -> None:
 
     Raises:
         UsageError: the name has other characters than letters, digits and ``._-``, does not
-            begin with a letter, or reads as an id prefix.
+            begin with a letter, reads as an id prefix, or stands for any store in a path.
     """
+    if name == DEFAULT_ROOT:
+        raise UsageError(
+            f"{name!r} cannot be a name: {name}/ID names an artefact of any store",
+            "choose another name",
+        )
     if not is_name(name):
         raise UsageError(
             f"{name!r} cannot be a name",

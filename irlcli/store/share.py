@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from irlcli.errors import IntegrityError
+from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.store.artefact import Artefact, stored_inputs
 from irlcli.store.substitute import Advance, ancestors
 
@@ -46,6 +46,7 @@ def share(
     artefacts: Sequence[Artefact],
     warn: Callable[[str], None],
     start: Callable[[int, int], Advance],
+    partial: bool = False,
 ) -> Shared:
     """Copy ``artefacts`` of ``source``, their ancestors and their names to ``target``.
 
@@ -58,7 +59,7 @@ def share(
             ``target``, and neither does any that was made from it.
         OSError: a disk is full or not writable.
     """
-    wanted = _with_ancestors(source, artefacts, warn)
+    wanted = _with_ancestors(source, artefacts, warn, partial)
     target.create()
     with target.in_use():
         # Asked once: in a bucket, each question is a request.
@@ -89,18 +90,26 @@ def size(artefact: Artefact) -> int:
 
 
 def _with_ancestors(
-    source: Place, artefacts: Sequence[Artefact], warn: Callable[[str], None]
+    source: Place, artefacts: Sequence[Artefact], warn: Callable[[str], None], partial: bool
 ) -> list[Artefact]:
-    """``artefacts``, each after all that it was made from."""
+    """``artefacts``, each after all that it was made from.
+
+    ``partial``: without those that were made from a damaged one.
+    """
     found: dict[str, Artefact] = {}
     for artefact in artefacts:
         index = source.manifests(artefact.id)
-        for member in (*ancestors(artefact, index), artefact):
-            if member.id in found:
-                continue
-            found[member.id] = member
-            if orphaned := index.orphaned(member):
-                _check_missing(source, member, orphaned, warn)
+        members = [m for m in (*ancestors(artefact, index), artefact) if m.id not in found]
+        try:
+            for member in members:
+                if orphaned := index.orphaned(member):
+                    _check_missing(source, member, orphaned, warn)
+        except IntegrityError as error:
+            if not partial or isinstance(error, NewerFormat):
+                raise
+            warn(f"skipping artefact {artefact.id}: {error.message}")
+            continue
+        found |= {member.id: member for member in members}
     return list(found.values())
 
 

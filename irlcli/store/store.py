@@ -145,6 +145,10 @@ class Store:
         """Name to id, sorted by name."""
         return references.names(self._layout)
 
+    def damaged_names(self) -> list[str]:
+        """The names whose file does not contain an id."""
+        return references.damaged_names(self._layout)
+
     def check_name(self, name: str) -> None:
         """Refuse an invalid name: see :func:`irlcli.store.references.check_name`."""
         references.check_name(name)

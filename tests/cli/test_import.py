@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +33,36 @@ def imported(irl, store, *words):
     done = irl("import", *words, "--store", store.path, "--quiet")
     assert done.code == 0, done.err
     return Store(store.path).resolve(done.out.strip().rpartition("/")[2]).artefact
+
+
+def test_an_output_path_that_links_to_itself_is_a_file_that_exists(irl, store_copy, tmp_path):
+    for name, target in (("loop", "loop"), ("dangling", "nowhere")):
+        (tmp_path / name).symlink_to(tmp_path / target)
+        words = ["export", "demos", "demos", "--to", f"parquet:{tmp_path / name}"]
+        assert_answered(irl(*words, "--store", store_copy.path), 2, f"{name} exists")
+        assert (tmp_path / name).is_symlink()
+
+
+def test_a_terminated_export_leaves_nothing(store_copy, tmp_path):
+    """The writer of the file is stopped by the signal that a batch system sends."""
+    code = (
+        "import os, signal, sys\n"
+        "from irlcli.data.exchange import transitions\n"
+        "def write(path, *_):\n"
+        "    path.write_text('half')\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    raise AssertionError('not reached')\n"
+        "transitions.write_transitions = write\n"
+        "from irlcli.cli.main import main\n"
+        "main()\n"
+    )
+    words = ["export", "demos", "demos", "--to", f"parquet:{tmp_path / 'x' / 'a.parquet'}"]
+    (tmp_path / "x").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words, "--store", store_copy.path], capture_output=True
+    )
+    assert done.returncode == 128 + signal.SIGTERM, done.stderr
+    assert list((tmp_path / "x").iterdir()) == []
 
 
 def assert_equal(one, two):

@@ -215,6 +215,14 @@ def changed(column, row, value):
         (changed("obs", 5, [9.0, 9.0, 9.0]), 5, "obs differs from next_obs"),
         (changed("episode", 8, 0), 8, "episode 0 begins again"),
         (changed("episode", 2, None), 2, "episode is missing"),
+        (changed("episode", 2, float("nan")), 2, "episode is not finite"),
+        (
+            lambda made: made.set_column(
+                made.schema.get_field_index("setting"), "setting", pa.array([["0.1"]] * len(made))
+            ),
+            0,
+            "setting is a list",
+        ),
         (
             lambda made: made.set_column(
                 made.schema.get_field_index("terminated"),

@@ -212,6 +212,39 @@ def test_scratch_directories_locks_names_and_claims_that_are_links_are_not_follo
     assert (outside / "precious").read_text() == "kept" * 10
 
 
+def test_artefacts_and_the_lock_of_gc_that_are_links_are_not_followed(irl, store_copy, tmp_path):
+    outside = tmp_path / "outside"
+    store = Store(store_copy.path)
+    (store.root / store_copy.transfer).rename(outside)
+    (store.root / store_copy.transfer).symlink_to(outside)
+    for name in store.names():
+        (store.root / ".names" / name).unlink()
+    before = outside.stat().st_mode, sorted(p.name for p in outside.iterdir())
+    done = irl("gc", "--delete", "--grace-days", "0", "--store", store.root)
+    assert done.code == 0, done.err
+    assert not os.path.lexists(store.root / store_copy.transfer)
+    assert (outside.stat().st_mode, sorted(p.name for p in outside.iterdir())) == before
+    evil = tmp_path / "evil"
+    (evil / ".locks").mkdir(parents=True)
+    (evil / ".locks" / "gc").symlink_to(tmp_path / "created")
+    assert irl("pull", "--all", "--from", store_copy.path, "--store", evil).code != 0
+    assert not (tmp_path / "created").exists()
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**400), 10**3000])
+def test_huge_numbers_in_a_manifest_are_no_obstacle_to_listing(irl, publish, tmp_path, number):
+    """A manifest holds any JSON; a config is limited to 2**53."""
+    store = Store(tmp_path / "runs")
+    ppo = {"n_envs": number, "n_steps": number}
+    airl = {"penalty_weight": number, "penalty": "irmv1", "total_steps": 9, "ppo": ppo}
+    transfer = {"total_steps": number, "ceiling": number, "restarts": number}
+    for stage, config in (("train-airl", {"airl": airl}), ("transfer", {"transfer": transfer})):
+        artefact = publish(store, stage=stage, parameters=config).artefact
+        for line in (["ls"], ["lineage", artefact.id], ["show", artefact.id]):
+            done = irl(*line, "--store", store.root)
+            assert done.code == 0, done.err
+
+
 def planted(store: Store, source: str, name: str, data: bytes) -> None:
     """Replace ``source`` by an artefact with valid digests whose output ``name`` is ``data``."""
     artefact = store.get(source)

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -11,7 +12,9 @@ import pytest
 import torch
 
 from irlcli.data.tensors import load_policy_file, load_reward_file
+from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
+from irlcli.requests.arguments import warn_of_seen
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.sac import SACTrainer
 from irlcli.store import Store
@@ -189,6 +192,29 @@ def test_a_training_setting_is_named_as_for_evaluations(runs, irl):
     score = ["evaluate", "--policy", "airl", *common(runs), "--dry-run"]
     assert warned in irl(*score, "--ood", "2:0.6:0.6").err
     assert "warning" not in irl(*score).err
+
+
+@pytest.mark.parametrize(
+    ("trained", "shared", "apart"),
+    [
+        ("direction=-10..0", "direction=-5,0,-10..0,-5..5", "direction=1,0.5..3"),
+        ("leg-length=1.5", "leg-length=1.5x", "leg-length=1x,2"),
+    ],
+)
+def test_a_held_out_setting_that_shares_worlds_with_a_trained_one_is_named(trained, shared, apart):
+    origin = SimpleNamespace(env="half-cheetah", settings=(trained,))
+
+    def named(text):
+        said = []
+        settings = [parse_setting("half-cheetah", part) for part in texts(text)]
+        warn_of_seen(SimpleNamespace(warn=said.append), settings, origin, "irm")
+        return [line.partition(" is not held out")[0] for line in said]
+
+    def texts(text):
+        knob, _, values = text.partition("=")
+        return [f"{knob}={value}" for value in values.split(",")]
+
+    assert named(shared) == texts(shared) and named(apart) == []
 
 
 def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):

@@ -113,6 +113,22 @@ def test_dry_run_removes_nothing(empty_store, family):
     assert tree() == before
 
 
+def test_what_a_damaged_name_protects_is_not_deleted(irl, empty_store, family):
+    protected = empty_store.ids()[0]
+    empty_store.set_name("best", empty_store.get(protected))
+    for damage in ("", "garbage!!\n"):
+        (empty_store.root / ".names" / "best").write_text(damage)
+        listed = irl("gc", "--grace-days", "0", "--store", empty_store.root)
+        assert listed.code == 0 and "best is damaged" in listed.err
+        deleted = irl("gc", "--delete", "--grace-days", "0", "--store", empty_store.root)
+        assert deleted.code == 4 and "best is damaged" in deleted.err
+        checked = irl("verify", "--store", empty_store.root)
+        assert checked.code == 4 and "best" in checked.err
+    assert len(empty_store.ids()) == 5
+    assert irl("name", protected, "best", "--store", empty_store.root).code == 0
+    assert irl("verify", "--store", empty_store.root).code == 0
+
+
 def test_collect_refuses_a_store_in_use(empty_store, family):
     with empty_store.in_use(), pytest.raises(Busy):
         Store(empty_store.root).collect(DAY)

@@ -71,6 +71,23 @@ def test_a_damaged_manifest_there_leaves_the_others(irl, store, chain, place, tm
     assert refused.code == 4 and f"hint: remove the artefact in {place}" in refused.err
 
 
+@pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
+def test_what_was_made_from_a_damaged_artefact_is_left_out_of_all(
+    irl, store, chain, place, publish, tmp_path
+):
+    other_expert = publish(store, parameters={"seed": 9}).artefact
+    push(store, place, *chain.values(), other_expert)
+    if "://" in place:
+        emptied(at(place, chain["demos"], "manifest.json"))
+    else:
+        manifest = Path(place) / chain["demos"].id / "manifest.json"
+        manifest.chmod(0o644)
+        manifest.write_bytes(b"")
+    pulled = irl("pull", "--all", "--from", place, "--store", tmp_path / "other")
+    assert pulled.code == 0 and f"skipping artefact {chain['airl'].id}" in pulled.err
+    assert set(other(tmp_path).ids()) == {chain["expert"].id, other_expert.id}
+
+
 def test_a_damaged_artefact_here_is_not_pushed(irl, store, chain, url):
     path = chain["demos"].directory / "f"
     path.chmod(0o644)

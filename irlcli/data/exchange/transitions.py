@@ -120,6 +120,10 @@ def _settings(batch: pa.RecordBatch, expected: Expected, place: Place) -> np.nda
             _check_settings(batch.column(SETTING), expected, place)
         return np.zeros(batch.num_rows, dtype=np.int64)
     column = batch.column(expected.column)
+    if pa.types.is_nested(column.type):
+        raise UsageError(
+            f"{place(0)}: {expected.column} is a list", "name a column of text or numbers"
+        )
     require_all(column, expected.column, place)
     coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
     codes = coded.indices.to_numpy()
@@ -162,6 +166,11 @@ class _EpisodeStarts:
         if pa.types.is_nested(named.type):
             raise UsageError(f"{place(0)}: episode is a list", "write a number or text")
         require_all(named, "episode", place)
+        if pa.types.is_floating(named.type):
+            finite = pc.is_finite(named)
+            if not pc.all(finite).as_py():
+                row = pc.index(finite, False).as_py()
+                raise UsageError(f"{place(row)}: episode is not finite", "number the episodes")
         changes = pc.indices_nonzero(pc.not_equal(named[1:], named[:-1])).to_numpy() + 1
         first = np.zeros(len(named), dtype=bool)
         first[changes] = True
