@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from irlcli.data.steps import Irregular
 from irlcli.errors import UsageError, first_line
-from irlcli.interventions import parse_setting
+from irlcli.interventions import parse_setting, world
 from irlcli.trajectories import ActionSpace
 
 Place = Callable[[int], str]
@@ -55,11 +55,12 @@ class Expected:
         of_the_only = [f"{knob}={text}" for knob in knobs] if len(knobs) == 1 else []
         for written in (text, *of_the_only):
             try:
-                found = str(parse_setting(self.env, written))
+                found = world(parse_setting(self.env, written))
             except UsageError:
                 continue
-            if found in self.settings:
-                return self.settings.index(found)
+            for index, own in enumerate(self.settings):
+                if world(parse_setting(self.env, own)) == found:
+                    return index
         raise UsageError(
             f"{place}: setting {text[:80]!r} is not one of {', '.join(self.settings)}",
             "name every setting of the source by --intervention or --setting",
@@ -75,10 +76,10 @@ class Expected:
         """
         (only,) = self.settings
         try:
-            found = str(parse_setting(self.env, str(name)))
+            found = parse_setting(self.env, str(name))
         except UsageError:
             return
-        if found != only:
+        if world(found) != world(parse_setting(self.env, only)):
             raise UsageError(
                 f"{place} is of {found}, as its {SETTING!r} says, not of {only}",
                 "name the settings that the source holds, or rename that column",
