@@ -7,7 +7,8 @@ dataset in memory.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -50,18 +51,17 @@ class Steps:
 
     def take(self, rows: np.ndarray | slice) -> Steps:
         """The steps at ``rows``. Their places are lost."""
-        return Steps(
-            first=self.first[rows],
-            settings=self.settings[rows],
-            observations=self.observations[rows],
-            actions=self.actions[rows],
-            rewards=None if self.rewards is None else self.rewards[rows],
-            next_observations=self.next_observations[rows],
-            terminated=self.terminated[rows],
-            truncated=self.truncated[rows],
-            seeds=self.seeds[rows],
-            place=nowhere,
-        )
+        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "place"}
+        taken: dict[str, Any] = {
+            name: None if column is None else column[rows] for name, column in columns.items()
+        }
+        return Steps(**taken, place=nowhere)
+
+    def times(self, before: int) -> np.ndarray:
+        """t [B] of each step in its episode, of which ``before`` steps come before the first row."""
+        rows = np.arange(len(self))
+        start = np.maximum.accumulate(np.where(self.first, rows, -1))
+        return np.where(start >= 0, rows - start, rows + before)
 
 
 def mixed_rewards() -> UsageError:
@@ -210,9 +210,7 @@ class Check:
             steps = replace(steps, actions=steps.actions - self.start)
         self._check_numbers(steps)
         self._check_order(steps)
-        rows = np.arange(len(steps))
-        start = np.maximum.accumulate(np.where(steps.first, rows, -1))
-        t = np.where(start >= 0, rows - start, rows + self._t)
+        t = steps.times(self._t)
         last = np.append(steps.first[1:], complete)
         ended = steps.terminated | steps.truncated
         long = t >= self.horizon

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,10 +68,8 @@ def write_stream(
     schema = schema.with_metadata(tags)
     table = _EpisodeTable(width, rewarded)
     with writer(directory / STEPS, schema, repeating=()) as file:
-        piece: Steps | None = first
-        while piece is not None:
+        for piece in itertools.chain([first], stream):
             file.write_table(table.add(schema, piece), row_group_size=max(1, len(piece)))
-            piece = next(stream, None)
     rows = table.rows(settings, episodes_schema(width, rewarded=rewarded).with_metadata(tags))
     write_table(rows, directory / EPISODES)
     return table.written()
@@ -90,11 +89,9 @@ class _EpisodeTable:
         """The rows of ``steps.parquet`` for ``steps``, with ``schema``."""
         if (steps.rewards is not None) != self._rewarded:
             raise mixed_rewards()
-        rows = np.arange(len(steps))
         ends = np.flatnonzero(steps.terminated | steps.truncated)
-        start = np.maximum.accumulate(np.where(steps.first, rows, -1))
-        t = np.where(start >= 0, rows - start, rows + self._length)
-        episode = self._count + np.searchsorted(ends, rows)
+        t = steps.times(self._length)
+        episode = self._count + np.searchsorted(ends, np.arange(len(steps)))
         self._parts.append(
             (
                 steps.settings[ends],

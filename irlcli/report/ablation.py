@@ -6,14 +6,13 @@ Points are those of :mod:`irlcli.report.compute`; the variants stand where metho
 from __future__ import annotations
 
 import matplotlib
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from irlcli.report.agents import title
 from irlcli.report.compute import points_of, whole_seeds
-from irlcli.report.drawing import panels
+from irlcli.report.drawing import panels, spread
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.statistics import holm, paired_p, summarise
 from irlcli.report.tables import Table
@@ -211,8 +210,14 @@ def _panel(axis: Axes, p: Parameters, row: Row, found: pd.DataFrame) -> None:
         ):
             values = 100 * over_settings(found, row, variant.name, measure).to_numpy()
             n = len(values)
-            offsets = shift + (np.linspace(-0.1, 0.1, n) if n > 1 else np.zeros(n))
-            axis.plot(x + offsets, values, "o", ms=4.5, label=label if x == 0 else None, **form)
+            axis.plot(
+                x + shift + spread(n, 0.1),
+                values,
+                "o",
+                ms=4.5,
+                label=label if x == 0 else None,
+                **form,
+            )
             if measure == _RETRAINED and n:
                 axis.plot([x - 0.3, x + 0.06], [values.mean()] * 2, color=_COLOUR, lw=2)
     names = [v.name.replace(" ", "\n", 1) for v in p.variants]

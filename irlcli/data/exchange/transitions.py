@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -206,12 +207,10 @@ def write_transitions(
     names = pa.array(settings)
     done = 0
     with writer(path, schema, repeating=("setting",)) as file:
-        piece: Steps | None = first
-        while piece is not None:
+        for piece in itertools.chain([first], stream):
             table = _table(piece, schema, names, done)
             file.write_table(table, row_group_size=len(piece))
             done += int((piece.terminated | piece.truncated).sum())
-            piece = next(stream, None)
 
 
 def _schema(first: Steps, env: str) -> pa.Schema:
