@@ -178,6 +178,14 @@ def test_environment_replays_from_a_seed_and_renders_as_text():
     assert env.render().splitlines()[0] == "....G"
 
 
+@pytest.mark.parametrize("action", [-1, 4, 1.5])
+def test_other_actions_than_the_four_are_refused(action):
+    env = Gridworld(5)
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="action must be 0, 1, 2 or 3"):
+        env.step(action)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

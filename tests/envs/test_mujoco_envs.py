@@ -67,6 +67,15 @@ def test_passes_gymnasiums_checker(name):
     env.close()
 
 
+def test_gymnasiums_arguments_keep_their_meaning(name):
+    arguments = {"exclude_current_positions_from_observation": False}
+    ours = ROBOTS[name](**arguments)
+    original = gymnasium.make(f"{name}-v5", **arguments).unwrapped
+    found, expected = (env.reset(seed=3)[0] for env in (ours, original))
+    np.testing.assert_array_equal(found, expected.astype(np.float32))
+    assert ours.observation_space.contains(found)
+
+
 def test_an_episode_depends_on_its_seed_only(name):
     env = ROBOTS[name]()
     expected = roll(env, 7)
