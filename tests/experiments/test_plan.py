@@ -7,7 +7,7 @@ import json
 import pytest
 
 from irlcli.configs import load_config
-from irlcli.experiments.rows import Chosen, Run, comparison
+from irlcli.experiments.rows import Chosen, RewardRun, comparison
 from irlcli.experiments.tables import Row, Table
 from irlcli.store import Store
 
@@ -255,7 +255,7 @@ def test_further_retrainings_have_seeds_of_their_own():
     def configs(env, flags):
         return load_config(env, "smoke", flags=flags)
 
-    runs = [Run("erm", "erm", seed, str(row), configs) for seed in table.seeds]
+    runs = [RewardRun("erm", "erm", seed, str(row), configs) for seed in table.seeds]
     tasks = comparison(row, table.measures, table.retrainings, runs, configs, Chosen((), None))
     found = {t.name: t.request.parameters.seed for t in tasks if t.phase == "transfers"}
     assert found["reacher.gravity.erm.0.transfer"] == 0
