@@ -124,8 +124,9 @@ def test_a_variable_horizon_is_only_tried_where_episodes_can_end():
 
 
 def test_one_process_at_a_time(tmp_path, monkeypatch, capsys):
-    (tmp_path / "runs").mkdir()
-    unfinished = tmp_path / "runs" / "ours.part"
+    for name in ("runs", "records"):
+        (tmp_path / name).mkdir()
+    unfinished = tmp_path / "records" / "ours.part"
     unfinished.touch()
     monkeypatch.setattr(sys, "argv", ["peers", "--out", str(tmp_path)])
     with (

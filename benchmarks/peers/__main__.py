@@ -1,7 +1,7 @@
 """Run and compare: ``python -m benchmarks.peers``, by ``make bench-peers``, which takes hours.
 
-Every run is a process of its own that records its checks. What is finished is not repeated, so the
-same command continues after an interruption; an unfinished run begins again.
+Every run is a process of its own that records its checks in ``OUT/records``. What is finished is not
+repeated, so the same command continues after an interruption; an unfinished run begins again.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from irlcli.store.lock import locked
 
 _ROOT = Path(__file__).parents[2]
 _ZOO = _ROOT / "zoo"
+# What a run is told about its demonstrations: their id, and where they are here.
+_FOUND = ("demonstrations", "dataset", "demos")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -80,7 +82,8 @@ def _options() -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> None:
     runs = options.out / "runs"
-    runs.mkdir(parents=True, exist_ok=True)
+    for directory in (runs, options.out / "records"):
+        directory.mkdir(parents=True, exist_ok=True)
     # Two processes would delete each other's unfinished runs.
     alone = locked(runs / ".lock", what=f"the runs in {runs}")
     with nullcontext() if options.report else alone:
@@ -94,14 +97,15 @@ def _run_in(runs: Path, options: argparse.Namespace) -> None:
         values = ",".join(load_config(env).interventions[knob].id)
         settings[row] = [str(setting) for setting in parse_settings(env, f"{knob}={values}")]
     wanted = tasks(settings, options.methods, options.seeds)
-    files = {task: runs / f"{task.name}.jsonl" for task in wanted}
+    records = options.out / "records"
+    files = {task: records / f"{task.name}.jsonl" for task in wanted}
     missing = [task for task in wanted if not enough(files[task], options.limit)]
     failed: list[str] = []
     if not options.report:
         theirs = any(METHODS[task.method].module == "theirs" for task in missing)
         if theirs and not options.peers_python.is_file():
             raise UsageError(f"{options.peers_python} does not exist", "make bench-peers makes it")
-        for leftover in runs.glob("*.part"):
+        for leftover in records.glob("*.part"):
             leftover.unlink()
         about = {row: _demonstrations(row, runs) for row in options.rows}
         about_all = {"commit": _commit(), "machine": _machine(), "limit": options.limit}
@@ -110,9 +114,10 @@ def _run_in(runs: Path, options: argparse.Namespace) -> None:
         def execute(task: Task) -> str | None:
             found = about[task.row]
             values = (
-                task._asdict() | about_all | {name: found[name] for name in ("demos", "dataset")}
+                task._asdict() | about_all | {name: found[name] for name in _FOUND}
             )
             values["targets"] = [found["returns"][text] for text in task.settings]
+            values["file"] = str(files[task].absolute())
             return _execute(task, values, runs, options.peers_python)
 
         pool = ThreadPoolExecutor(options.jobs)
@@ -141,7 +146,6 @@ def enough(path: Path, limit: float) -> bool:
 def _execute(task: Task, run: dict[str, Any], runs: Path, peers: Path) -> str | None:
     """Run ``task`` in a process of its own; its name if that failed."""
     method = METHODS[task.method]
-    run["file"] = str((runs / f"{task.name}.jsonl").absolute())
     python = sys.executable if method.module == "ours" else str(peers.absolute())
     command = [python, "-m", f"benchmarks.peers.{method.module}", json.dumps(run)]
     variables = {"PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
@@ -164,7 +168,12 @@ def _demonstrations(row: str, directory: Path) -> dict[str, Any]:
         )
     frame = pd.read_parquet(file, columns=["episode", "setting", "reward"])
     returns = frame.groupby(["setting", "episode"])["reward"].sum().groupby("setting").mean()
-    return {"dataset": str(source.path), "demos": str(file), "returns": returns.to_dict()}
+    return {
+        "demonstrations": source.path.name,
+        "dataset": str(source.path),
+        "demos": str(file),
+        "returns": returns.to_dict(),
+    }
 
 
 def _commit() -> str:

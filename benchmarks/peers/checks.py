@@ -26,6 +26,8 @@ from irlcli.envs.registry import environment
 from irlcli.interventions import parse_setting
 from irlcli.seeds import derive
 
+# Fields of a run that name files of this machine.
+_PATHS = ("file", "demos", "dataset")
 EPISODES = 10
 # A run is checked at the first end of a round after each multiple of so many steps.
 EVERY = 25_000
@@ -79,7 +81,9 @@ class Checks:
         self._shares: list[float] = []
         self._due = EVERY
         versions = {name: _version(name) for name in _LIBRARIES}
-        self._write({**run, "versions": versions})
+        # The record is kept in the repository.
+        about = {name: value for name, value in run.items() if name not in _PATHS}
+        self._write({**about, "versions": versions})
         self._origin = time.process_time()
 
     def begin(self) -> None:
