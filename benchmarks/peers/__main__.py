@@ -113,9 +113,7 @@ def _run_in(runs: Path, options: argparse.Namespace) -> None:
 
         def execute(task: Task) -> str | None:
             found = about[task.row]
-            values = (
-                task._asdict() | about_all | {name: found[name] for name in _FOUND}
-            )
+            values = task._asdict() | about_all | {name: found[name] for name in _FOUND}
             values["targets"] = [found["returns"][text] for text in task.settings]
             values["file"] = str(files[task].absolute())
             return _execute(task, values, runs, options.peers_python)
