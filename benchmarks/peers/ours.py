@@ -43,7 +43,7 @@ def main() -> None:
         request = train_expert.request(env, settings[0], run["seed"], config.expert_of(settings[0]))
     else:
         # The defaults of grouping and penalty are ERM's.
-        airl = config.airl_of(settings[0])
+        airl = config.airl_of(settings)
         request = train_airl.request(Source(demos, ""), env, settings, airl, run["seed"])
         if airl.challenger.life > 0:
             challenger_steps = airl.challenger.ppo.steps_per_round
