@@ -24,7 +24,7 @@ from irlcli.learners.airl import AIRL
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
-from irlcli.rl.worlds import Worlds, action_space, make_worlds
+from irlcli.rl.worlds import Worlds, action_space, make_worlds, observation_size
 from irlcli.trajectories import Trajectory
 
 INTERVENTIONS = {
@@ -52,11 +52,14 @@ def main() -> None:
     trainer, learner, challengers = build(arguments.env, worlds, demos, config)
 
     seconds: dict[str, float] = defaultdict(float)
-    worlds.step = _timed(worlds.step, seconds, "environment")
-    worlds.reset = _timed(worlds.reset, seconds, "environment")
-    trainer.model.collect_rollouts = _timed(trainer.model.collect_rollouts, seconds, "rollout")
-    trainer.model.train = _timed(trainer.model.train, seconds, "PPO update")
-    learner.rewards = _timed(learner.rewards, seconds, "rewards")
+    for owner, name, part in (
+        (worlds, "step", "environment"),
+        (worlds, "reset", "environment"),
+        (trainer.model, "collect_rollouts", "rollout"),
+        (trainer.model, "train", "PPO update"),
+        (learner, "rewards", "rewards"),
+    ):
+        setattr(owner, name, _timed(getattr(owner, name), seconds, part))
 
     steps = 0
     for index in range(-1, arguments.rounds):
@@ -114,13 +117,13 @@ def build(
         worlds=len(worlds),
         rounds=trainer.rounds,
         horizon=environment(env).max_episode_steps,
-        observation_size=worlds.observation_space.shape[0],
+        observation_size=observation_size(worlds.observation_space),
         actions=action_space(worlds.action_space),
         seed=0,
     )
     if config.challenger.life == 0:
         return trainer, learner, None
-    return trainer, learner, Challengers(worlds, config.challenger, learner, 0, "bench")
+    return trainer, learner, Challengers([worlds], config.challenger, learner, 0, "bench")
 
 
 def _timed(function: Callable, seconds: dict[str, float], part: str) -> Callable:

@@ -14,6 +14,7 @@ import os
 import sys
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import torch
 
@@ -42,6 +43,7 @@ def main(demonstrations: str, learned: str) -> None:
     for setting, episodes in demos.trajectories.items():
         data = transitions(episodes, environment(demos.env).max_episode_steps)
         space = make(demos.env, parse_setting(demos.env, setting)).action_space
+        assert isinstance(space, gymnasium.spaces.Box)
         size = np.abs(data.actions) / space.high
         own = replace(data, actions=policy.act(data.observations))
         for kind in ("sampled", "executed"):

@@ -25,7 +25,7 @@ from irlcli.experiments.cluster.records import Submitted, new_record
 from irlcli.experiments.plan import Plan, Selection
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import load_table
-from irlcli.stages.base import From
+from irlcli.stages.base import From, Request
 from irlcli.store import KeyRecord, Manifest, Output, Store
 from irlcli.store.claim import HEARTBEAT_SECONDS, live_reader, read
 from irlcli.store.manifest import encode_provenance
@@ -114,8 +114,15 @@ def fill(plan: Plan, store: Store) -> None:
     started = time.monotonic()
     for name, task in plan.tasks.items():
         paths = read_later[id(task.request)] or {"summary.json"}
-        write_artefact(store, name, plan.lookup.record(task.request), dict.fromkeys(paths))
+        write_artefact(store, name, record_of(plan, task.request), dict.fromkeys(paths))
     print(f"wrote {len(plan.tasks):,} artefacts in {time.monotonic() - started:.0f} s")
+
+
+def record_of(plan: Plan, request: Request) -> KeyRecord:
+    """What the key of ``request`` is made from."""
+    record = plan.lookup.record(request)
+    assert record is not None
+    return record
 
 
 def write_artefact(

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -50,7 +51,7 @@ def main() -> None:
         print(json.dumps(measured(arguments.part, arguments.directory)))
         return
     counts = [arguments.steps // 10, arguments.steps]
-    found = {n: {part: {} for part in PARTS} for n in counts}
+    found: dict[int, dict[str, Any]] = {n: {part: {} for part in PARTS} for n in counts}
     for steps in counts:
         with tempfile.TemporaryDirectory() as directory:
             write_source(Path(directory) / "source.parquet", steps, arguments.length)

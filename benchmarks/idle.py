@@ -15,7 +15,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from benchmarks.cluster import fill, write_artefact
+from benchmarks.cluster import fill, record_of, write_artefact
 from benchmarks.sharing import IRL
 from irlcli.configs import load_config
 from irlcli.experiments import report
@@ -60,7 +60,7 @@ def add_report(plan: Plan, store: Store) -> None:
     document = json.dumps({"tables": [table], "caveats": ["None of it was computed."]})
     name = f"{PROFILE}.{TABLE}"
     files = {f"{TABLE}.json": document.encode()}
-    write_artefact(store, name, plan.lookup.record(request), files)
+    write_artefact(store, name, record_of(plan, request), files)
 
 
 def measure(label: str, command: list[str]) -> None:

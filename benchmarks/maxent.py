@@ -89,8 +89,11 @@ def compare(imitation: str | None) -> None:
     one, many = (solve(settings, r, HORIZON) for r in (rewards[:1], rewards))
     ours = best_of(100, lambda: solve(settings, rewards[:1], HORIZON, reuse=one))
     batch = best_of(10, lambda: solve(settings, rewards, HORIZON, reuse=many))
-    rows = [("one run", *ours), (f"each of {RUNS} runs in one call", *(x / RUNS for x in batch))]
-    references = []
+    rows: list[tuple[str, float, float]] = [
+        ("one run", *ours),
+        (f"each of {RUNS} runs in one call", batch[0] / RUNS, batch[1] / RUNS),
+    ]
+    references: list[tuple[str, float, float, float]] = []
 
     def difference(policy, states):
         policies = np.abs(matching.policy[:, :, 0, :, 0].transpose(0, 2, 1) - policy[:-1]).max()

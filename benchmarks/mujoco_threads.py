@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import gymnasium
 import mujoco
 import numpy as np
 from mujoco import rollout
@@ -84,9 +85,10 @@ def main(rounds: int) -> None:
     for name in ("mujoco-half-cheetah", "mujoco-hopper", "mujoco-ant", "mujoco-humanoid"):
         robots = [make(name, parse_setting(name, "default")) for _ in range(WORLDS)]
         space = robots[0].action_space
+        assert isinstance(space, gymnasium.spaces.Box)
         shape = (STEPS, WORLDS, *space.shape)
         controls = np.random.default_rng(0).uniform(space.low, space.high, shape)
-        scratch = [mujoco.MjData(robots[0].model) for _ in range(THREADS)]
+        scratch = [mujoco.MjData(robots[0].get_wrapper_attr("model")) for _ in range(THREADS)]
         with ThreadPoolExecutor(THREADS) as threads, rollout.Rollout(nthread=THREADS) as pool:
             ways = {
                 "one after the other": one_after_the_other,

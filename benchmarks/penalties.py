@@ -21,7 +21,7 @@ from irlcli.learners import learner
 from irlcli.methods import METHODS, fields
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
-from irlcli.rl.worlds import action_space, make_worlds
+from irlcli.rl.worlds import action_space, make_worlds, observation_size
 
 
 def main() -> None:
@@ -50,7 +50,7 @@ def main() -> None:
                 worlds=len(worlds),
                 rounds=trainer.rounds,
                 horizon=spec.max_episode_steps,
-                observation_size=worlds.observation_space.shape[0],
+                observation_size=observation_size(worlds.observation_space),
                 actions=action_space(worlds.action_space),
                 seed=0,
             )

@@ -12,8 +12,10 @@ because caches are cold after waking.
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -31,9 +33,8 @@ def cpu_seconds(pid: int) -> float:
         return int(schedstat.read().split()[0]) * 1e-9
 
 
-def times(worlds: WorkerWorlds) -> np.ndarray:
-    """Seconds of each step [T, 2 + workers]: clock, parent's CPU, each worker's CPU."""
-    pids = [process.pid for process in worlds._processes]
+def times(worlds: WorkerWorlds, pids: Sequence[int]) -> np.ndarray:
+    """Seconds of each step [T, 2 + workers]: clock, parent's CPU, CPU of each worker of ``pids``."""
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (STEPS, WORLDS, 8))
     worlds.reset(range(WORLDS))
     rows = []
@@ -51,8 +52,13 @@ def times(worlds: WorkerWorlds) -> np.ndarray:
 def main(rounds: int) -> None:
     """Print a line for each number of workers, and the ratios."""
     factories = [partial(make, "ant", parse_setting("ant", "default"))] * WORLDS
-    teams = [WorkerWorlds(factories, STEPS + 1, workers) for workers in (1, 2)]
-    rows = [[times(team) for team in teams] for _ in range(rounds)]
+    teams: dict[WorkerWorlds, list[int]] = {}
+    for workers in (1, 2):
+        others = {process.pid for process in multiprocessing.active_children()}
+        team = WorkerWorlds(factories, STEPS + 1, workers)
+        pids = {process.pid for process in multiprocessing.active_children()} - others
+        teams[team] = [pid for pid in pids if pid is not None]
+    rows = [[times(*team) for team in teams.items()] for _ in range(rounds)]
     measured = [np.array(samples) for samples in zip(*rows, strict=True)]
     for team in teams:
         team.close()

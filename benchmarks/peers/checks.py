@@ -17,7 +17,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -112,7 +112,7 @@ class Checks:
         # What the check took does not count.
         self._origin = time.process_time() - cpu
 
-    def end(self, why: str) -> None:
+    def end(self, why: str) -> NoReturn:
         """Record the end: ``goal``, ``limit``, or ``budget`` if its steps are used up.
 
         Raises:

@@ -10,7 +10,7 @@ import json
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from benchmarks.peers.checks import Checks, Ended
 from irlcli.configs import load_config
@@ -26,8 +26,22 @@ class _Quiet:
     def progress(self, done: int, total: int, unit: str, facts: Any) -> None:
         pass
 
+    def scalars(self, step: int, values: Any) -> None:
+        pass
+
     def warn(self, message: str) -> None:
         print(message, file=sys.stderr)
+
+
+class _NoCheckpoints:
+    def load(self) -> None:
+        return None
+
+    def discard(self, reason: str) -> None:
+        pass
+
+    def offer(self, state: Any) -> None:
+        pass
 
 
 def main() -> None:
@@ -48,7 +62,7 @@ def main() -> None:
         if airl.challenger.life > 0:
             challenger_steps = airl.challenger.ppo.steps_per_round
 
-    def run_training(job: Job, training: Training) -> None:
+    def run_training(job: Job, training: Any) -> NoReturn:
         def after_round(training: Training, rows: Any) -> None:
             steps = training.trainer.steps + training.rounds_done * challenger_steps
             policy = training.trainer.policy
@@ -61,7 +75,7 @@ def main() -> None:
     train_airl.run_training = train_expert.run_training = run_training
     inputs = {"demonstrations": demos}
     with tempfile.TemporaryDirectory() as output, contextlib.suppress(Ended):
-        request.stage.run(Job(request.parameters, inputs, Path(output), None, _Quiet()))
+        request.stage.run(Job(request.parameters, inputs, Path(output), _NoCheckpoints(), _Quiet()))
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ pooled demonstrations, which is ERM. Nothing is logged, and all worlds are stepp
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import sys
 import tempfile
@@ -43,7 +44,7 @@ from imitation.util.networks import RunningNorm
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from benchmarks.peers.absorbing import AbsorbingState
 from benchmarks.peers.checks import Checks, Ended
@@ -112,15 +113,15 @@ def main() -> None:
 
 def _train_expert(run: dict[str, Any], checks: Checks) -> None:
     env = run["row"].split(".")[0]
-    worlds = _worlds(run, _ZOO_WORLDS)
     values = _ZOO[env]
+    worlds: VecEnv = _worlds(run, _ZOO_WORLDS)
     if env == "half-cheetah":
         worlds = VecNormalize(worlds, gamma=values["gamma"])
     model = PPO(env=worlds, seed=run["seed"], device="cpu", **values)
 
     def act(seen: np.ndarray) -> np.ndarray:
         if isinstance(worlds, VecNormalize):
-            seen = worlds.normalize_obs(seen)
+            seen = np.asarray(worlds.normalize_obs(seen))
         return model.predict(seen, deterministic=True)[0]
 
     class Check(BaseCallback):
@@ -203,7 +204,7 @@ def _worlds(run: dict[str, Any], count: int, fixed: bool = False) -> DummyVecEnv
         world = build(spec, env_kwargs(env, setting), str(setting))
         return TimeLimit(AbsorbingState(world) if fixed else world, spec.max_episode_steps)
 
-    venv = DummyVecEnv([lambda i=i: make(i) for i in range(count)])
+    venv = DummyVecEnv([functools.partial(make, i) for i in range(count)])
     venv.seed(run["seed"])
     return venv
 

@@ -31,10 +31,10 @@ class Selection(NamedTuple):
     """
 
     tag: str
-    candidates: Sequence[float] | Literal["own"]
-    until: rows.Phase
-    only: str | None
-    listing: str
+    candidates: Sequence[float] | Literal["own"] = ()
+    until: rows.Phase = "returns"
+    only: str | None = None
+    listing: str = "irl plan"
 
 
 class Plan:
