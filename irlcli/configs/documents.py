@@ -61,7 +61,10 @@ def converted(value: Any, form: type[Form], where: str, examples: str) -> Form:
     """
     fields = form.__struct_fields__
     if not isinstance(value, Mapping):
-        raise UsageError(f"{where}: expected a table, found {value!r}", f"write [{where}]")
+        raise UsageError(
+            f"{where}: expected a table, found {value!r}",
+            f"write [{where}], or put the line below the [NAME] that it belongs to",
+        )
     for name in value:
         if name not in fields:
             raise UsageError(f"unknown field {f'{where}.{name}'!r}", suggest(name, fields))

@@ -18,6 +18,7 @@ from irlcli.errors import NotFound, UsageError, closest, suggest
 from irlcli.experiments.variants import read_variants
 from irlcli.interventions import knob_of
 from irlcli.methods import METHODS
+from irlcli.report.agents import RETRAINED
 from irlcli.report.parameters import ASSESS, CUE, Variant
 
 Kind = Literal["comparison", "experts", "figure2", "control"]
@@ -288,6 +289,15 @@ def _comparison(name: str, filled: _Listed, directory: Path) -> dict[str, Any]:
     penalised = [method for method in METHODS if METHODS[method].penalty != "none"]
     for method in weights:
         _one_of(f"{name}.penalty_weights", method, penalised)
+        if method not in methods:
+            raise UsageError(
+                f"{name}.penalty_weights: {method} is not among the methods of {name}",
+                f"omit it, or add {method} to {name}.methods",
+            )
+    if (filled.retrainings or 1) > 1 and not {*RETRAINED} & {*measures}:
+        raise UsageError(
+            f"{name}.retrainings: {', '.join(measures)} retrains no policy", "omit retrainings"
+        )
     return {
         "rows": tuple(rows),
         "methods": methods,
@@ -325,7 +335,11 @@ def _variants(
 
 def _row(field: str, text: str, directory: Path, measures: Sequence[str]) -> Row:
     """A row such as ``ant.mass``, or ``hopper.toml.mass`` with a file beside the table's."""
-    env, _, knob = text.rpartition(".") if ".toml." in text else text.partition(".")
+    env, dot, knob = text.rpartition(".") if ".toml." in text else text.partition(".")
+    if not dot:
+        raise UsageError(
+            f"{field}: {text!r} names no intervention", f"write {text}.KNOB: `irl envs show {text}`"
+        )
     try:
         spec = resolve(str(directory / env)) if env.endswith(".toml") else _named(env, text)
         has_cue = knob_of(spec.name, knob).cue is not None

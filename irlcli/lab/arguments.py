@@ -67,6 +67,10 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
         # ``**configs`` would take any name.
         for name in kwargs.keys() - known:
             raise UsageError(f"{shown} has no argument {name!r}", suggest(name, known))
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise UsageError(f"{shown}: {error}", f"write {shown}{_shape(signature)}") from None
         given = signature.bind_partial(*args, **kwargs).arguments
         configs = given.pop("configs", {})
         for name, value in (given | configs).items():
@@ -82,6 +86,14 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
             raise failed from None
 
     return call
+
+
+def _shape(signature: inspect.Signature) -> str:
+    """``(env, *, seed=0)``: the arguments without their annotations."""
+    plain = [
+        p.replace(annotation=p.empty) for p in signature.parameters.values() if p.name != "self"
+    ]
+    return str(inspect.Signature(plain))
 
 
 def _forms(annotation: str) -> list[str]:

@@ -170,6 +170,8 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
         (lambda lab: irlcli.Lab("s", set=[3]), UsageError, "set 3 is not text"),
         (lambda lab: lab.train_airl("demos", seed=True), UsageError, "seed True is not a whole"),
         (lambda lab: lab.evaluate(idle="yes", **IDLE), UsageError, "idle 'yes' is not True or"),
+        (lambda lab: lab.train_airl("demos", "irm", 10), UsageError, "train_airl: too many"),
+        (lambda lab: lab.collect_experts(), UsageError, "collect_experts: missing a required"),
         (lambda lab: lab.plan(None), UsageError, "table None is not text"),
         (lambda lab: lab.evaluate("airl", settings=3), UsageError, "settings 3 is not text or a"),
         (lambda lab: irlcli.Lab("s", storee=1), UsageError, "Lab has no argument 'storee'"),
