@@ -21,11 +21,11 @@ from irlcli.report.text import number, p_value, percent
 _MAIN_NOTE = (
     "Mean true return ± standard deviation over seeds. p: Welch's test, "
     f"{title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a p-value. "
-    "(3/5): three of five seeds exist; (part): some evaluations are missing. † not imitated in distribution. ‡ runs of more than one commit "
-    "or set of libraries. Training experts, reused: the experts of the training settings, each "
-    "evaluated where the students are, their mean: the return without learning a reward. Progress: "
-    "the part of the return earned by walking or reaching (an idle ant earns about 600 for being "
-    "alive)."
+    "(3/5): three of five seeds exist; (part): some evaluations are missing. † not imitated in "
+    "distribution. ‡ runs of more than one commit or set of libraries. Training experts, reused: the "
+    "experts of the training settings, each evaluated where the students are, their mean: the return "
+    "without learning a reward. Progress: what walking or reaching earned, before costs (an ant also "
+    "earns about 600 for being alive); for MuJoCo's robots, metres forward."
 )
 _RETRAININGS_NOTE = (
     " Each reward was retrained {} times: the return of a seed is their mean, and ± is over seeds. "
