@@ -16,7 +16,7 @@ from irlcli.cli.session import Session, StageSession
 from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
 
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
-# As of the seeds in a table.
+# The largest seed that a table may list.
 MAX_SEED = 2**53
 Seed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Seed of everything random.")]
 Name = Annotated[str | None, typer.Option(help="Name to give the artefact.")]

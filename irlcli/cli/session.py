@@ -73,7 +73,7 @@ class Session(base.Session):
                 f"{path} cannot be written: {error.strerror or error}",
                 f"name another file with {option}",
             ) from None
-        terminated = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         try:
             with scratch as directory:
                 part = Path(directory) / path.name
@@ -85,7 +85,7 @@ class Session(base.Session):
             # PyArrow and HDF5 name no file where a disk is full.
             raise StageFailed(f"{path} cannot be written: {first_line(error)}", RETRY) from None
         finally:
-            signal.signal(signal.SIGTERM, terminated)
+            signal.signal(signal.SIGTERM, before)
 
 
 class StageSession(base.StageSession):

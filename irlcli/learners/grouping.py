@@ -74,7 +74,7 @@ def deal(counts: Sequence[int], rng: np.random.Generator) -> list[np.ndarray]:
     groups = []
     for setting, count in enumerate(counts):
         to = (setting + np.arange(count)) % size
-        # Otherwise no setting reaches every group, and the last group would be empty.
+        # If no setting reaches every group, this would leave the last groups empty.
         if max(counts) >= size:
             more = count % size
             to[count - more :] = np.arange(more)
