@@ -10,25 +10,6 @@ from irlcli.configs.load import field_of, overridden
 from irlcli.configs.schema import UNSET_MEANS
 from irlcli.stages.base import From, Request
 
-# The parts of a config that a stage and its command read. Challengers learn with the PPO of retrained
-# policies, clones also have the student's network, and a collected expert is compared with the bar.
-_SECTIONS = {
-    "assess": {"assessment"},
-    "choose-penalty": {"airl", "transfer.ppo", "evaluation"},
-    "clone": {"airl.actions", "clone"},
-    "collect-experts": {"demonstrations", "expert.bar"},
-    "control-labels": {"control"},
-    "control-maps": {"control"},
-    "evaluate": {"evaluation"},
-    "import": set[str](),
-    "measure-cue": {"evaluation"},
-    "record": {"assessment"},
-    "sweep-maxent": {"maxent", "figure2"},
-    "train-airl": {"airl", "transfer.ppo"},
-    "train-expert": {"expert"},
-    "train-maxent": {"maxent"},
-    "transfer": {"transfer"},
-}
 # A policy that begins as the student holds these values under the fields that they replace.
 _OF_STUDENTS = "transfer.from_student."
 
@@ -64,20 +45,12 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
 
 
 def unread(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[str]:
-    """The overrides whose field none of ``requests`` reads; none if a stage is not known here."""
-    made = {(r.stage.name, hasattr(r.parameters, "gridworld")) for r in requests}
-    if not {name for name, _ in made} <= _SECTIONS.keys():
-        return
+    """The overrides whose field none of ``requests`` reads; none if a stage does not say."""
     read = set[str]()
-    for name, tabular in made:
-        if (name, tabular) == ("collect-experts", True):
-            read |= {"demonstrations.episodes", "gridworld"}
-        else:
-            read |= _SECTIONS[name]
-        if name == "clone":
-            from irlcli.stages.clone import Network
-
-            read |= {f"airl.ppo.{field}" for field in Network.__struct_fields__}
+    for request in requests:
+        if request.stage.reads is None:
+            return
+        read.update(request.stage.reads)
     for item in overrides:
         field = field_of(item)
         if not any(f"{field}.".startswith(f"{part}.") for part in read):

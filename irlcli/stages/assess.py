@@ -197,4 +197,4 @@ def _epic_distances(
     return found, ""
 
 
-STAGE = Stage("assess", 3, run)
+STAGE = Stage("assess", 3, run, reads=("assessment",))

@@ -76,11 +76,16 @@ class Job(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A kind of work. A change that alters results must raise ``version``."""
+    """A kind of work. A change that alters results must raise ``version``.
+
+    ``reads`` are the parts of a config that the stage and its command read, e.g. ``airl.ppo``: a
+    ``--set`` of another field has no effect, so the user is warned. None: no warning.
+    """
 
     name: str
     version: int
     run: Callable[[Job], None]
+    reads: Sequence[str] | None = None
 
 
 class Source(NamedTuple):

@@ -148,4 +148,5 @@ def run(job: Job) -> None:
     write_json(job.output / "choice.json", msgspec.to_builtins(choice))
 
 
-STAGE = Stage("choose-penalty", 3, run)
+# Challengers learn with the PPO of retrained policies.
+STAGE = Stage("choose-penalty", 3, run, reads=("airl", "transfer.ppo", "evaluation"))

@@ -117,4 +117,9 @@ def run(job: Job) -> None:
     )
 
 
-STAGE = Stage("clone", 1, run)
+STAGE = Stage(
+    "clone",
+    1,
+    run,
+    reads=("airl.actions", "clone", *(f"airl.ppo.{name}" for name in Network.__struct_fields__)),
+)

@@ -206,5 +206,8 @@ def _record(job: Job, found: Iterable[list[Trajectory]], metadata: Mapping[str, 
     write_json(job.output / "summary.json", {"env": p.environment.name, "settings": summary})
 
 
-STAGE = Stage("collect-experts", 2, run)
-TABULAR_STAGE = Stage("collect-experts", 2, run_tabular)
+# The command compares experts with their bar.
+STAGE = Stage("collect-experts", 2, run, reads=("demonstrations", "expert.bar"))
+TABULAR_STAGE = Stage(
+    "collect-experts", 2, run_tabular, reads=("demonstrations.episodes", "gridworld")
+)

@@ -114,4 +114,4 @@ def run(job: Job) -> None:
     write_table(pa.Table.from_pylist(rows), job.output / "accuracy.parquet")
 
 
-STAGE = Stage("control-labels", 2, run)
+STAGE = Stage("control-labels", 2, run, reads=("control",))

@@ -273,4 +273,4 @@ def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:
     return rows
 
 
-STAGE = Stage("control-maps", 3, run)
+STAGE = Stage("control-maps", 3, run, reads=("control",))

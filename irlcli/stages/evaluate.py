@@ -165,4 +165,4 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", document | {"settings": summary})
 
 
-STAGE = Stage("evaluate", 3, run)
+STAGE = Stage("evaluate", 3, run, reads=("evaluation",))

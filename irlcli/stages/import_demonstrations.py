@@ -189,4 +189,4 @@ def _means(index: int, text: str, written: Written) -> dict[str, Any]:
     }
 
 
-STAGE = Stage("import", 1, run)
+STAGE = Stage("import", 1, run, reads=())

@@ -217,4 +217,4 @@ def _fit(
         return learner.fit(p.shared.iterations, after_record=after_record)
 
 
-STAGE = Stage("sweep-maxent", 3, run)
+STAGE = Stage("sweep-maxent", 3, run, reads=("maxent", "figure2"))

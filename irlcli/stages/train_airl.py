@@ -373,4 +373,5 @@ def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping
     return stop
 
 
-STAGE = Stage("train-airl", 5, run)
+# Challengers learn with the PPO of retrained policies.
+STAGE = Stage("train-airl", 5, run, reads=("airl", "transfer.ppo"))

@@ -81,4 +81,4 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-STAGE = Stage("train-expert", 2, run)
+STAGE = Stage("train-expert", 2, run, reads=("expert",))

@@ -258,4 +258,4 @@ def _number(x: float) -> float | None:
     return None if x != x else float(x)
 
 
-STAGE = Stage("train-maxent", 3, run)
+STAGE = Stage("train-maxent", 3, run, reads=("maxent",))

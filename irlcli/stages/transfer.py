@@ -184,4 +184,4 @@ def _student(path: Path, config: Any) -> tuple[Policy, Any]:
     return student, replace(config, **{name: getattr(about.network, name) for name in own})
 
 
-STAGE = Stage("transfer", 3, run)
+STAGE = Stage("transfer", 3, run, reads=("transfer",))
