@@ -88,7 +88,7 @@ def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> 
 
 
 def print_report(session: StageSession, artefact: Artefact) -> None:
-    """The tables and caveats of a report on stderr, with the note of the first table only."""
+    """A report's tables, caveats and result on stderr, with the note of the first table only."""
     _warn_of_versions(session, artefact)
     report = report_json(session, artefact)
     if report is None:
@@ -100,8 +100,9 @@ def print_report(session: StageSession, artefact: Artefact) -> None:
         out.print_note(f"{table['note']}\n" if table is shown[0] else "")
     if any(table["note"] for table in shown[1:]):
         out.print_note("The report's README.md explains the columns of the other tables.\n")
-    for caveat in report["caveats"]:
-        out.print_note(f"- {caveat}")
+    for heading, lines in (("Caveats", report["caveats"]), ("In short", report.get("in_short"))):
+        if lines:
+            out.print_note("\n".join([f"{heading}:", *(f"- {line}" for line in lines), ""]))
 
 
 def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from irlcli.report import ablation, caveats, compute, cue, result_tables, retrained
+from irlcli.report.in_short import in_short
 from irlcli.report.parameters import Parameters
 from irlcli.report.tables import Table
 
@@ -29,6 +30,7 @@ class Report:
             :func:`irlcli.report.ablation.summarise_variants`; empty without variants.
         reward_quality: see :func:`irlcli.report.compute.reward_quality`.
         cue_contrasts: see :func:`irlcli.report.cue.cue_contrasts`.
+        in_short: see :func:`irlcli.report.in_short.in_short`.
         tables: the same for people.
         caveats: what a reader must know before drawing conclusions.
     """
@@ -44,6 +46,7 @@ class Report:
     cue_contrasts: pd.DataFrame
     shares: pd.DataFrame
     variants: pd.DataFrame
+    in_short: list[str]
     tables: list[Table]
     caveats: list[str]
 
@@ -116,6 +119,7 @@ def build(
         cue_contrasts=cue_contrasts,
         shares=shares,
         variants=variants,
+        in_short=in_short(p, cells, comparisons),
         tables=[table for table in tables if table.rows],
         caveats=found,
     )

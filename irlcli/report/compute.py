@@ -180,7 +180,8 @@ def _with_imitation(p: Parameters, table: pd.DataFrame) -> pd.DataFrame:
 def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) -> pd.DataFrame:
     """A row per row, measure and pair of methods (x, y), over seeds with every evaluation.
 
-    Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means; two-sided p-values
+    Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means, ``low`` and ``high``, its
+    95 % interval by Welch's test, and the ``detectable`` difference; two-sided p-values
     ``p_welch`` (primary), ``p_welch_holm`` (over the rows, in an ablation over the rows and
     variants), ``p_paired`` (over the ``pairs`` seeds that both methods have), ``p_student`` and
     ``p_rank`` (Mann-Whitney); ``improvement``, the probability that a seed of x beats one of y;
@@ -208,6 +209,7 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
                 tests, samples, tested, adjusted, strict=True
             ):
                 common = a.index.intersection(b.index)
+                low, high = c.interval or (None, None)
                 found.append(
                     {
                         "row": row.name,
@@ -215,6 +217,9 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
                         "x": x,
                         "y": y,
                         "difference": c.difference,
+                        "low": low,
+                        "high": high,
+                        "detectable": c.detectable,
                         "p_welch": c.welch,
                         "p_welch_holm": p_holm,
                         "p_paired": paired_p(a[common].tolist(), b[common].tolist()),
@@ -226,8 +231,9 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
                         "why": c.why,
                     }
                 )
-    columns = ["row", "measure", "x", "y", "difference", "p_welch", "p_welch_holm", "p_paired"]
-    columns += ["pairs", "p_student", "p_rank", "improvement", "not_imitated", "why"]
+    columns = ["row", "measure", "x", "y", "difference", "low", "high", "detectable", "p_welch"]
+    columns += ["p_welch_holm", "p_paired", "pairs", "p_student", "p_rank", "improvement"]
+    columns += ["not_imitated", "why"]
     return pd.DataFrame(found, columns=columns)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 
 from irlcli.labels import duration
@@ -20,19 +20,19 @@ _VARIANT_FILES = "`variants.csv`: a row per variant. `shares.csv`: shares of the
 
 
 def latex(report: Report) -> str:
-    """Every table; the caveats are comments."""
-    caveats = "".join(f"% {caveat}\n" for caveat in report.caveats)
+    """Every table; the caveats and what stands above them are comments."""
+    comments = "".join(f"% {line}\n" for line in (*report.in_short, *report.caveats))
     tables = [latex_table(t.columns, t.rows, f"{t.title}. {t.note}".strip()) for t in report.tables]
-    return f"% Needs \\usepackage{{booktabs,longtable}}.\n{caveats}\n" + "\n".join(tables)
+    return f"% Needs \\usepackage{{booktabs,longtable}}.\n{comments}\n" + "\n".join(tables)
 
 
 def markdown(p: Parameters, report: Report) -> str:
     """The report without learning curves and lineage."""
     parts = [f"# {p.title}\n", f"`{p.command}`, {_made(p)}\n"]
     parts.append(f"![every seed]({p.kind}.png)\n")
-    if report.caveats:
-        parts.append("## Caveats\n")
-        parts.append("".join(f"- {caveat}\n" for caveat in report.caveats))
+    for heading, lines in (("In short", report.in_short), ("Caveats", report.caveats)):
+        if lines:
+            parts += [f"## {heading}\n", "".join(f"- {line}\n" for line in lines)]
     for table in report.tables:
         parts += [f"## {table.title}\n", markdown_table(table.columns, table.rows)]
         if table.title == REWARD_QUALITY:
@@ -81,7 +81,7 @@ tbody th { font-weight: normal; }
 tr.paper td, tr.paper th { font-style: italic; opacity: .8; }
 figure { margin: 1rem 0; } figure svg { max-width: 100%; height: auto; }
 pre { font-size: .82rem; overflow-x: auto; } summary { cursor: pointer; padding: .15rem 0; }
-.caveats li { margin: .2rem 0; }
+.lines li { margin: .2rem 0; }
 @media print { nav, .skip { display: none; } body { font-size: 10pt; max-width: none; }
   .wide { overflow: visible; } figure, tr { break-inside: avoid; } h2 { break-after: avoid; } }
 """
@@ -102,9 +102,10 @@ def html(
     """
     first = len(p.rows) if p.variants else len(p.measures)
     sections = [
+        *([("In short", _list(report.in_short))] if report.in_short else []),
         (
             "Caveats",
-            f'<ul class="caveats">{"".join(f"<li>{escape(c)}</li>" for c in report.caveats)}</ul>'
+            _list(report.caveats)
             if report.caveats
             else "<p>None: no run is missing, mixed or left out.</p>",
         ),
@@ -145,6 +146,10 @@ def html(
         f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
         f'<main id="content">{body}</main></body></html>\n'
     )
+
+
+def _list(lines: Sequence[str]) -> str:
+    return f'<ul class="lines">{"".join(f"<li>{escape(line)}</li>" for line in lines)}</ul>'
 
 
 def _figure(caption: str, svg: str) -> str:

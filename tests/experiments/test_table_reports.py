@@ -88,7 +88,8 @@ def report(irl, tables):
 
 
 def caveats(result):
-    return [line[2:] for line in result.err.splitlines() if line.startswith("- ")]
+    listed, _, _ = result.err.partition("In short:")
+    return [line[2:] for line in listed.splitlines() if line.startswith("- ")]
 
 
 def test_the_report_says_what_the_evaluations_say(report, table_store):
@@ -252,7 +253,10 @@ def test_json_holds_the_tables(report, table_store):
     done = report("table1", table_store, *ROW, "--json")
     value = json.loads(done.out)
     assert value["kind"] == "artefact" and "table1.html" in value["outputs"]
-    assert value["report"]["caveats"] == caveats(report("table1", table_store, *ROW))
+    printed = report("table1", table_store, *ROW)
+    assert value["report"]["caveats"] == caveats(printed)
+    (line,) = value["report"]["in_short"]
+    assert printed.err.rstrip().endswith(f"In short:\n- {line}")
     agents = {(c["agent"], c["measure"]) for c in value["report"]["cells"]}
     assert {("erm", "transfer"), ("expert", "id"), ("random", "ood")} <= agents
 

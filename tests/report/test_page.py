@@ -64,14 +64,15 @@ def test_the_page_is_well_formed_and_self_contained():
     assert "prefers-color-scheme: dark" in html and "@media print" in html
 
 
-def test_caveats_are_in_every_format():
+def test_what_came_out_and_caveats_are_in_every_format():
     p, points = example(complete() | {(BOUNCE, "irm", "transfer"): [5.0, None, None]})
     report = build(p, points, {}, {})
     html = "".join(parsed(page.html(p, report, "<svg/>", {}, {})).text)
-    assert report.caveats
-    for caveat in report.caveats:
-        assert all(caveat in text for text in (html, page.markdown(p, report), page.latex(report)))
+    assert report.caveats and report.in_short
+    for line in report.caveats + report.in_short:
+        assert all(line in text for text in (html, page.markdown(p, report), page.latex(report)))
     assert as_json(report)["caveats"] == report.caveats
+    assert as_json(report)["in_short"] == report.in_short
 
 
 def test_json_has_no_nan():

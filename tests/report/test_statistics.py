@@ -12,6 +12,7 @@ from irlcli.report import paper
 from irlcli.report.statistics import (
     bootstrap_interval,
     compare,
+    detectable_difference,
     holm,
     identical_runs,
     interquartile_mean,
@@ -76,6 +77,34 @@ def test_pairs_take_out_what_seeds_share():
     x, y = [1.1, 101.2, 201.0, 301.1], [0.0, 100.0, 200.0, 300.0]
     assert paired_p(x, y) < 0.001 < 0.9 < compare(x, y).welch
     assert paired_p([1.0], [0.0]) is None
+
+
+@pytest.mark.parametrize(("n", "effect"), [(26, 0.8), (64, 0.5), (394, 0.2)])
+def test_the_detectable_difference_is_cohens(n, effect):
+    """Cohen (1988), table 2.4.1: the fewest samples of each group that find an effect."""
+
+    def detectable(size):
+        return detectable_difference(*[with_moments(0.0, 1.0, size)] * 2)
+
+    assert detectable(n) <= effect < detectable(n - 1)
+
+
+def test_the_detectable_difference_is_found_four_times_in_five():
+    rng = np.random.default_rng(0)
+    x, y = with_moments(0.0, 3.0, 5), with_moments(7.0, 3.0, 3)
+    shift = detectable_difference(x, y)
+    drawn = rng.normal(shift, 3.0, (20_000, 5)), rng.normal(0.0, 3.0, (20_000, 3))
+    found = stats.ttest_ind(*drawn, axis=1).pvalue < 0.05
+    assert found.mean() == pytest.approx(0.8, abs=0.01)
+
+
+@given(returns, returns)
+def test_the_interval_excludes_zero_where_welch_is_significant(x, y):
+    found = compare(x, y)
+    assume(found.interval is not None and abs(found.welch - 0.05) > 1e-6)
+    low, high = found.interval
+    assert low <= found.difference <= high
+    assert (low > 0 or high < 0) == (found.welch < 0.05)
 
 
 def test_a_missing_p_value_has_a_reason():

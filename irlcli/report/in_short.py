@@ -1,0 +1,61 @@
+"""What came out, one line per row of a table: the first thing to read in a report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pandas as pd
+
+from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
+from irlcli.report.parameters import Parameters
+from irlcli.report.statistics import LEVEL
+from irlcli.report.text import number, p_value
+
+
+def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
+    """The first measure of each row: the true returns, and whether the first pair of methods differs.
+
+    None for an ablation, whose first table compares its variants.
+    """
+    measure = next((measure for measure in p.measures if measure in MEASURES), None)
+    if p.variants or measure is None:
+        return []
+    baseline = "id" if measure in IN_DISTRIBUTION else "ood"
+    lines = []
+    for row in p.rows:
+        found = cells[cells["row"] == row.name]
+        means = {
+            r.agent: f"{title(r.agent)} {number(r.mean)}"
+            for r in found[found["mean"].notna()].itertuples()
+            if r.measure == (baseline if r.agent in BASELINES else measure)
+        }
+        tested = comparisons[(comparisons["row"] == row.name) & (comparisons["measure"] == measure)]
+        first = next(tested[tested["difference"].notna()].itertuples(), None)
+        methods = p.methods if first is None else (first.y, first.x)
+        shown = [means[agent] for agent in (*methods, "expert", "reused") if agent in means]
+        if not any(method in means for method in methods):
+            continue
+        verdict = "" if first is None else f" {_verdict(first)}"
+        lines.append(
+            f"{row.name}, {MEASURES[measure].partition(':')[0]}: {'; '.join(shown)}.{verdict}"
+        )
+    return lines
+
+
+def _verdict(test: Any) -> str:
+    """Whether the pair of methods of ``test`` differs, and what difference would have been found."""
+    x, y = title(test.x), title(test.y)
+    if test.not_imitated:
+        failed = " and ".join(map(title, test.not_imitated.split()))
+        return f"{failed} did not imitate in distribution: do not interpret the gap."
+    if pd.isna(test.p_welch):
+        return f"No test of {x} against {y}: {test.why}."
+    claim = f"{x} and {y} do not differ significantly"
+    if test.p_welch_holm < LEVEL:
+        more = "more" if test.difference > 0 else "less"
+        claim = f"{x} earns significantly {more} than {y}"
+    return (
+        f"{claim}: {test.difference:+.1f} (95 % interval {test.low:.1f} to {test.high:.1f}, "
+        f"p {p_value(test.p_welch_holm)}). A difference of {test.detectable:.1f} would be found with "
+        "a power of 80 %."
+    )
