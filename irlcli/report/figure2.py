@@ -48,6 +48,38 @@ def summary(quality: pd.DataFrame) -> pd.DataFrame:
     return found.rename(columns={"n": "datasets"})
 
 
+def differences(quality: pd.DataFrame, unseen: Sequence[str]) -> pd.DataFrame:
+    """By how much a penalty changes the probability of reaching the goal in the ``unseen`` settings.
+
+    Paired over datasets, each with its interval: ``variant`` minus ERM, minus ERM-balanced (lambda 0)
+    and minus the same penalty with shuffled labels, the column ``against``.
+    """
+    rows = quality.drop_duplicates("variant")
+    reached = quality[quality["setting"].isin(unseen)].set_index(["variant", "setting", "seed"])
+    reached = reached["goal_probability"]
+    plain = rows[(rows["l2"] == 0) & rows["grouping"].isin(["pooled", "balanced"])]["variant"]
+    found = []
+    for r in rows[rows["grouping"] == "per-setting"].itertuples():
+        same = (rows["penalty"] == r.penalty) & (rows["penalty_weight"] == r.penalty_weight)
+        shuffled = rows[same & (rows["grouping"] == "shuffled")]["variant"]
+        for against in (*plain, *shuffled):
+            difference = (reached[r.variant] - reached[against]).rename("difference").reset_index()
+            found.append(difference.assign(variant=r.variant, against=against))
+    return means(pd.concat(found), ["variant", "against", "setting"], ["difference"])
+
+
+def differences_table(
+    found: pd.DataFrame, unseen: Sequence[str]
+) -> tuple[list[str], list[list[str]]]:
+    """Column names, and a row per variant and what it is compared with."""
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for r in found.itertuples():
+        row = rows.setdefault((r.variant, r.against), {})
+        row[r.setting] = interval_text(r.mean, r.low, r.high, 2)
+    lines = [[*pair, *(row[u] for u in unseen)] for pair, row in rows.items()]
+    return ["method", "minus", *unseen], lines
+
+
 def table(summarised: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     """Column names, and a row per variant; its cells are ``mean [low, high]`` over datasets."""
     wanted = [("goal probability, worst trained", "goal_probability", "worst", 2)]
@@ -67,8 +99,13 @@ def table(summarised: pd.DataFrame, unseen: Sequence[str]) -> tuple[list[str], l
     return ["method", *(w[0] for w in wanted)], rows
 
 
-def page(summarised: pd.DataFrame, unseen: Sequence[str], facts: Sequence[str]) -> str:
-    """The picture and the table as Markdown; ``facts`` are what they were made from."""
+def page(
+    summarised: pd.DataFrame, changes: pd.DataFrame, unseen: Sequence[str], facts: Sequence[str]
+) -> str:
+    """The picture and the tables as Markdown; ``facts`` are what they were made from.
+
+    ``changes`` are the :func:`differences`.
+    """
     listed = "\n".join(f"- {fact}." for fact in facts)
     return f"""# Figure 2
 
@@ -80,7 +117,12 @@ Cells are means over the datasets, with bootstrap 95 % intervals. *Worst trained
 settings trained on, in each dataset. The number after a penalty is its lambda, after `l2` the L2
 weight. `irm-shuffled` deals the episodes out to the risks at random; every setting keeps its weight.
 
-{markdown_table(*table(summarised, unseen))}"""
+{markdown_table(*table(summarised, unseen))}
+## Paired differences
+
+Goal probability of a penalised method minus that of another one, paired over the datasets.
+
+{markdown_table(*differences_table(changes, unseen))}"""
 
 
 @dataclass(frozen=True)

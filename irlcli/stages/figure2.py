@@ -35,7 +35,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
 def request(
     env: str, settings: Sequence[Setting], unseen: Sequence[Setting], config: Config
 ) -> Request:
-    """Outputs ``figure2.png``, ``.pdf``, ``.csv`` (every measure) and ``README.md`` (the table).
+    """Outputs ``figure2.png``, ``.pdf``, ``.csv`` (every measure), ``differences.csv`` and ``README.md``.
 
     Raises:
         UsageError: as :func:`irlcli.stages.sweep_maxent.request`.
@@ -108,6 +108,8 @@ def run(job: Job) -> None:
     drawn = [panel(variant, title) for variant, title in panels()]
     figure2.draw(job.output, maze, drawn, summary, figure2.curves(quality), p.seed)
     write_csv(job.output / "figure2.csv", summary)
+    differences = figure2.differences(quality, p.unseen)
+    write_csv(job.output / "differences.csv", differences)
     m = p.shared
     warmup = m.penalty_warmup_iterations
     facts = [
@@ -120,7 +122,7 @@ def run(job: Job) -> None:
         f"Fit: {m.iterations} iterations of RMSProp at learning rate {m.learning_rate:g}"
         + (f", the first {warmup} at lambda 0" if warmup else ""),
     ]
-    (job.output / "README.md").write_text(figure2.page(summary, p.unseen, facts))
+    (job.output / "README.md").write_text(figure2.page(summary, differences, p.unseen, facts))
 
 
-STAGE = Stage("figure2", 4, run)
+STAGE = Stage("figure2", 5, run)

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pandas as pd
+import pytest
 
-from irlcli.report.figure2 import MEASURES, curves, summary, table
+from irlcli.report.figure2 import MEASURES, curves, differences, summary, table
 from irlcli.report.tables import markdown_table
 
 
@@ -43,6 +44,28 @@ def test_table_has_a_row_per_variant():
         "| --- | --- |",
         "| erm | 1.00 [1.00, 1.00] |",
     ]
+
+
+def test_differences_are_paired_over_datasets():
+    """The datasets differ by 0.5, the methods by 0.1 in each of them."""
+    rows = quality("erm", "c", False, [0.1, 0.6]) + quality(
+        "erm l2 0.1", "c", False, [1.0, 1.0], l2=0.1
+    )
+    rows += quality("erm-balanced", "c", False, [0.2, 0.2], grouping="balanced")
+    for grouping, variant, values in (
+        ("per-setting", "irm", [0.2, 0.7]),
+        ("shuffled", "irm-shuffled", [0.0, 0.9]),
+    ):
+        penalised = {"grouping": grouping, "penalty": "irmv1", "penalty_weight": 0.05}
+        rows += quality(f"{variant} irmv1 0.05", "c", False, values, **penalised)
+    found = differences(pd.DataFrame(rows), ["c"]).set_index("against")
+    assert set(found["variant"]) == {"irm irmv1 0.05"}
+    assert found["mean"].round(9).to_dict() == {
+        "erm": 0.1,
+        "erm-balanced": 0.25,
+        "irm-shuffled irmv1 0.05": 0.0,
+    }
+    assert found.loc["erm", ["low", "high"]].tolist() == pytest.approx([0.1, 0.1])
 
 
 def test_curves_start_at_weight_zero_with_the_control_beside_the_method():
