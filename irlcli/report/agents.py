@@ -15,6 +15,9 @@ MEASURES = {
     "transfer-id": "Transfer in distribution: a policy retrained in each training setting, their mean",
     "id": "In distribution: the student, mean over the training settings",
 }
+PROGRESS = (
+    "Progress: what walking or reaching earned, before costs; for MuJoCo's robots, metres forward."
+)
 # Measures of policies trained on the frozen reward, and measures in the training settings.
 RETRAINED = ("transfer", "from-student", "transfer-id")
 IN_DISTRIBUTION = ("transfer-id", "id")

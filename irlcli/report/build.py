@@ -96,6 +96,7 @@ def build(
     found = [
         *caveats.missing(p),
         *caveats.weak_experts(p, cells, assessments),
+        *caveats.below_bar(p, points),
         *caveats.not_imitated(cells),
         *caveats.short_of_expert(learned_returns),
         *caveats.yardsticks(cells, verdicts=not (learned_returns.empty and reward_quality.empty)),

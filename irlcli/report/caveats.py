@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -86,6 +87,23 @@ def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -
     ]
 
 
+def below_bar(p: Parameters, points: pd.DataFrame) -> list[str]:
+    """Experts below the least return that the settings file asks of an expert."""
+    found = []
+    for row in p.rows:
+        bar = row.config["expert"].get("bar")
+        experts = points[(points["row"] == row.name) & (points["agent"] == "expert")]
+        low = experts[experts["true_return"] < (-math.inf if bar is None else bar)]
+        if len(low):
+            earned = zip(low["setting"], low["true_return"], strict=True)
+            listed = ", ".join(f"{setting} ({earns:.0f})" for setting, earns in earned)
+            found.append(
+                f"Expert below its bar of {bar:.0f}: {row.name}: {listed}. Shares of it overstate how well "
+                "a policy does."
+            )
+    return found
+
+
 def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
     """Retrained policies that fall short of the expert: a wrong reward, or failed optimisation."""
     found = []
@@ -99,7 +117,7 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
                 f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
             found.append(
-                f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.policies} retrained "
+                f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.judged} retrained "
                 f"policies. {' '.join(parts)}"
             )
     return found

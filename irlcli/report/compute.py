@@ -240,14 +240,14 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
 def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """What the frozen rewards score, a row per row and method.
 
-    Columns: ``row``, ``agent``; ``seeds`` and retrained ``policies`` that have both evaluations;
+    Columns: ``row``, ``agent``; ``seeds`` that have both evaluations, and the retrained policies of them
+    that were ``judged``: none beside an expert that is no better than the random agent;
     ``retrained`` and ``expert``, mean learned returns of the retrained policies and of the held-out
     setting's expert; ``short``, the policies that fall short of the expert, and
     ``short_scored_higher``, those of them because of a wrong reward: see
-    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return. None
-    falls short of an expert that is no better than the random agent.
+    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return.
     """
-    counted = ["seeds", "policies", "retrained", "expert", "short", "short_scored_higher"]
+    counted = ["seeds", "judged", "retrained", "expert", "short", "short_scored_higher"]
     columns = ["row", "agent", *counted]
     found = []
     for row in p.rows if "transfer" in p.measures else ():
@@ -268,7 +268,7 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             means = map(float, scores.groupby(both["seed"]).mean().mean())
             counts = len(verdicts) - verdicts.count("retrained"), verdicts.count("wrong reward")
             seeds = both["seed"].nunique()
-            found.append((row.name, method, seeds, len(both), *means, *counts))
+            found.append((row.name, method, seeds, len(verdicts), *means, *counts))
     return pd.DataFrame(found, columns=columns)
 
 

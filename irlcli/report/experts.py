@@ -11,6 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from irlcli.labels import duration
+from irlcli.report.agents import PROGRESS
 from irlcli.report.drawing import panels, save
 from irlcli.report.lineage import commits
 from irlcli.report.parameters import Cell, Run
@@ -18,8 +19,7 @@ from irlcli.report.tables import Table, markdown_table
 
 _TITLE = "Experts: true return in their own settings"
 _NOTE = (
-    "Mean true return of whole episodes ± standard deviation over episodes. Progress: the part of "
-    "the return earned by moving toward the goal, where the environment reports it; a robot that "
+    f"Mean true return of whole episodes ± standard deviation over episodes. {PROGRESS} A robot that "
     "stands still is rewarded for being alive. Random and idle agents learn nothing. Time: one "
     "process on a machine shared with other runs."
 )

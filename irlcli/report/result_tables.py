@@ -11,7 +11,7 @@ from scipy.stats import ttest_ind_from_stats
 from irlcli.data.descriptions import Verdict
 from irlcli.labels import duration, steps, steps_of_all_restarts
 from irlcli.report import paper
-from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
+from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, PROGRESS, title
 from irlcli.report.compute import failed_to_imitate
 from irlcli.report.lineage import commits, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
@@ -24,8 +24,7 @@ _MAIN_NOTE = (
     "(3/5): three of five seeds exist; (part): some evaluations are missing. † not imitated in "
     "distribution. ‡ runs of more than one commit or set of libraries. Training experts, reused: the "
     "experts of the training settings, each evaluated where the students are, their mean: the return "
-    "without learning a reward. Progress: what walking or reaching earned, before costs (an ant also "
-    "earns about 600 for being alive); for MuJoCo's robots, metres forward."
+    f"without learning a reward. {PROGRESS} An idle ant earns about 600."
 )
 _RETRAININGS_NOTE = (
     " Each reward was retrained {} times: the return of a seed is their mean, and ± is over seeds. "
@@ -43,7 +42,7 @@ _LEARNED_NOTE = (
     "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
     "discounts), mean over seeds; of the policy retrained on that reward, and of the held-out "
     "setting's expert. Short: policies with a regret of more than 10 % of what the "
-    "expert earns above the random agent. Scored higher: those of them that the reward scores at least "
+    "expert earns above the random agent; - beside an expert no better than the random agent. Scored higher: those of them that the reward scores at least "
     "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
     "show that the reward is right. Both are scored under the transfer.ceiling that the policy was "
     "trained under, if any. The unit is the standard deviation of g on the training data; zero has no "
@@ -227,7 +226,7 @@ def learned_returns(found: pd.DataFrame) -> Table:
             str(r.seeds),
             number(r.retrained),
             number(r.expert),
-            f"{r.short}/{r.policies}",
+            f"{r.short}/{r.judged}" if r.judged else "-",
             f"{r.short_scored_higher}/{r.short}" if r.short else "",
         ]
         for r in found.itertuples()

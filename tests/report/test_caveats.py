@@ -41,6 +41,15 @@ def test_an_expert_no_better_than_the_random_agent(expert, weak):
     assert not any(c.startswith("Weak expert") for c in seen)
 
 
+@pytest.mark.parametrize(("bar", "low"), [(None, False), (250.0, False), (251.0, True)])
+def test_an_expert_below_its_bar_is_named(bar, low):
+    p, points = example(complete())
+    expert = p.rows[0].config["expert"] | {"bar": bar}
+    rows = tuple(replace(row, config=row.config | {"expert": expert}) for row in p.rows)
+    found = build(replace(p, rows=rows), points, {}, {}).caveats
+    assert any(c.startswith(f"Expert below its bar of 251: {BOUNCE}: ") for c in found) == low
+
+
 def test_a_saturated_discriminator():
     learning = {
         (BOUNCE, "irm", 0): metrics(0.94, 0.001, 8.0),

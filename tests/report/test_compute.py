@@ -98,7 +98,7 @@ def test_learned_returns_rank_policy_and_expert():
     report = scored(pairs)
     assert report.learned_returns.to_dict("records") == [
         {
-            **{"row": BOUNCE, "agent": agent, "seeds": 3, "policies": 3},
+            **{"row": BOUNCE, "agent": agent, "seeds": 3, "judged": 3},
             **{"retrained": policy, "expert": expert, "short": 3, "short_scored_higher": higher},
         }
         for agent, policy, expert, higher in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 1))
@@ -124,7 +124,7 @@ def test_only_policies_that_fall_short_count_as_scored_higher(returns, short):
     assert any(c.startswith("Short of") for c in report.caveats) == (short > 0)
 
 
-def test_beside_an_expert_no_better_than_random_none_falls_short():
+def test_beside_an_expert_no_better_than_random_none_is_judged():
     values = complete() | {(BOUNCE, "erm", "transfer"): [5.0] * 3}
     values[BOUNCE, "erm", EXPERT_BY_REWARD] = [10.0] * 3
     values[BOUNCE, "random", "ood"] = [50.0]
@@ -132,7 +132,9 @@ def test_beside_an_expert_no_better_than_random_none_falls_short():
     points["learned_return"] = 0.0
     report = build(p, points, {}, {})
     (found,) = report.learned_returns.itertuples()
-    assert (found.policies, found.short, found.short_scored_higher) == (3, 0, 0)
+    assert (found.judged, found.short, found.short_scored_higher) == (0, 0, 0)
+    (table,) = (t for t in report.tables if t.title == "Learned returns")
+    assert dict(zip(table.columns, table.rows[0], strict=True))["short"] == "-"
     assert not any(c.startswith("Short of") for c in report.caveats)
 
 
@@ -145,7 +147,7 @@ def test_every_retrained_policy_of_a_reward_is_judged():
     points = pd.concat([points, second.assign(true_return=-100.0)], ignore_index=True)
     points["learned_return"] = 1.0
     (found,) = build(p, points, {}, {}).learned_returns.itertuples()
-    assert (found.seeds, found.policies, found.short) == (3, 6, 3)
+    assert (found.seeds, found.judged, found.short) == (3, 6, 3)
 
 
 def test_learned_returns_need_both_evaluations_of_a_seed():
