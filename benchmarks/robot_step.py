@@ -11,6 +11,7 @@ ends in ``-gymnasium`` Gymnasium's own MuJoCo environment.
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import subprocess
@@ -111,4 +112,6 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--roll-out"]:
         roll_out(sys.argv[2], int(sys.argv[3]))
     else:
-        main(sys.argv[1:])
+        parser = argparse.ArgumentParser(description=__doc__)
+        parser.add_argument("robots", nargs="*", choices=[*WORLDS, []])
+        main(parser.parse_args().robots)

@@ -8,6 +8,7 @@ Run with ``python -m benchmarks.sharing``; by ``make bench``.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import os
 import subprocess
@@ -31,6 +32,7 @@ BIG = 256 << 20
 
 def main() -> None:
     """Print a line for each command."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     os.environ |= {
         "AWS_ENDPOINT_URL": f"http://127.0.0.1:{PORT}",
         "AWS_ACCESS_KEY_ID": "x",

@@ -9,6 +9,7 @@ Run with ``python -m benchmarks.startup``; needs valgrind.
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import subprocess
@@ -24,6 +25,7 @@ HIT = [
 
 def main() -> None:
     """Print the instructions of ``irl --help``, ``irl ls`` and a cache hit, and their ratios."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     bare = instructions("pass")
     base = instructions("import typer, rich")
     print(f"{'command':20}{'10^6 instructions':>18}{'x base':>8}{'x base, less Python':>21}")

@@ -12,8 +12,8 @@ because caches are cold after waking.
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
-import sys
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -80,4 +80,6 @@ def main(rounds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if sys.argv[1:] else ROUNDS)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rounds", type=int, nargs="?", default=ROUNDS)
+    main(parser.parse_args().rounds)
