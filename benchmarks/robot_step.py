@@ -113,5 +113,5 @@ if __name__ == "__main__":
         roll_out(sys.argv[2], int(sys.argv[3]))
     else:
         parser = argparse.ArgumentParser(description=__doc__)
-        parser.add_argument("robots", nargs="*", choices=WORLDS)
-        main(parser.parse_args().robots)
+        parser.add_argument("robot", nargs="*", help=f"default: {', '.join(WORLDS)}")
+        main(parser.parse_args().robot)
