@@ -36,9 +36,8 @@ LISTED   = $(subst $(eval) ,$(COMMA),$(strip $(ROWS)))
 dashed   = $(subst /,-,$(subst $(eval) ,-,$(sort $(subst $(COMMA), ,$(1)))))
 PART     = $(addprefix -,$(call dashed,$(ROWS)))$(addprefix -,$(call dashed,$(METHODS)))$(addprefix -seeds-,$(call dashed,$(SEEDS)))
 RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(PART)
-# What names begin with, as irl chooses it: a table with settings of its own has a tag of its own.
-OWN     := demo control-airl-5 table1-5
-named    = $(or $(TAG),$(if $(filter $(1),$(OWN)),$(1)$(addprefix -,$(filter-out standard,$(PROFILE))),$(PROFILE)))
+# What the demo's names begin with, as irl chooses it.
+DEMO     = $(or $(TAG),demo$(addprefix -,$(filter-out standard,$(PROFILE))))
 
 IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
@@ -78,8 +77,8 @@ lint: $(READY)
 demo: $(READY)
 	$(IRL) run demo $(OPTIONS) --out $(RESULTS)
 	@echo; echo "report: $(RESULTS)/README.md and $(RESULTS)/demo.html"
-	@echo; echo "what the retrained policy of AIRL-IRM was made from:"
-	@$(IRL) lineage --store $(STORE) $(call named,demo).lunar-lander.engine-power.irm.0.transfer
+	@$(if $(SEEDS)$(METHODS),,echo; echo "what the retrained policy of AIRL-IRM was made from:"; \
+	    $(IRL) lineage --store $(STORE) $(DEMO).lunar-lander.engine-power.irm.0.transfer)
 
 all-results: experts table1 figure2 figure3 figure4 table2
 
@@ -98,8 +97,7 @@ experts figure2 control: $(READY)
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 
 report-%: $(READY)
-	$(IRL) report $* $(CHOSEN) --name $(call named,$*).$*$(PART) \
-	    --out results/$(or $(TAG),$(PROFILE))/$*$(PART)
+	$(IRL) report $* $(CHOSEN) --out results/$(or $(TAG),$(PROFILE))/$*$(PART)
 
 # The values of settings/*.toml; needs no store.
 table2: $(READY)
