@@ -1,4 +1,4 @@
-"""Makes what a plan is missing: one process per missing artefact, several at a time.
+"""Computes the missing steps of a plan: one process per missing artefact, several at a time.
 
 A step whose inputs exist is started; one that exists already, here or in another store, needs no
 process. A failed step stops only what depends on it.
@@ -217,7 +217,9 @@ class Execution:
                 self._outcome.made.append(child.name)
                 self._display.done(child.name, time.monotonic() - child.started)
                 return
-            why = Failure(1, "its process ended, but the artefact is missing", "")
+            why = Failure(
+                1, "its process ended, but the artefact is missing", "run the same command again"
+            )
         else:
             why = child.failure()
         code = child.process.returncode

@@ -67,7 +67,7 @@ def tensor_file(
             f"{ref!r} is a behavioural clone, which learned no reward",
             f"`irl evaluate --policy {ref}` measures its policy",
         )
-    output = resolved.output or _only(artefact, f"{kind}.pt")
+    output = resolved.output or _required(artefact, f"{kind}.pt")
     if output != f"{kind}.pt":
         holds = any(o.path == f"{kind}.pt" for o in artefact.manifest.outputs)
         raise UsageError(
@@ -77,7 +77,7 @@ def tensor_file(
             else f"its artefact holds no {kind}; {store.listing}",
         )
     source = source_of(Resolved(artefact, artefact.directory / output))
-    path = store.open(artefact, _only(artefact, f"{kind}.json"))
+    path = store.open(artefact, _required(artefact, f"{kind}.json"))
     if kind == "reward":
         return source, descriptions.parse(read_json(path), descriptions.Reward, path)
     return source, descriptions.parse(read_json(path), descriptions.Policy, path)
@@ -123,7 +123,7 @@ def student_beside(store: Store, reward: Source, origin: descriptions.Reward) ->
         NotFound: there is none beside the reward's file, or that of another reward.
     """
     if reward.artefact is not None:
-        student = reward.artefact.directory / _only(reward.artefact, "policy.pt")
+        student = reward.artefact.directory / _required(reward.artefact, "policy.pt")
         return source_of(Resolved(reward.artefact, student))
     student = reward.path.parent / "policy.pt"
     if not student.is_file():
@@ -286,7 +286,7 @@ def summary(store: Store, artefact: Artefact) -> descriptions.Evaluation:
         IntegrityError: damaged.
     """
     introduce(artefact)
-    path = store.open(artefact, _only(artefact, "summary.json"))
+    path = store.open(artefact, _required(artefact, "summary.json"))
     return descriptions.parse(read_json(path), descriptions.Evaluation, path)
 
 
@@ -352,11 +352,11 @@ def output(
         NotFound: the artefact has no such output.
         IntegrityError: damaged, or not a ``form``.
     """
-    path = store.open(artefact, _only(artefact, name))
+    path = store.open(artefact, _required(artefact, name))
     return descriptions.convert(read_json(path), form, path)
 
 
-def _only(artefact: Artefact, name: str) -> str:
+def _required(artefact: Artefact, name: str) -> str:
     names = [o.path for o in artefact.manifest.outputs]
     if name not in names:
         makers = {

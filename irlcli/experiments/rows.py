@@ -174,7 +174,9 @@ class _RowRequests:
 
 
 class _Reward(NamedTuple):
-    """A reward of a row, or a clone in its place, and what its tasks depend on; ``label`` is a reward's.
+    """A reward of a row, or the clone of a method without one, with what its tasks depend on.
+
+    Only a reward has a ``label``.
 
     Attributes:
         requests: of its row, under its own configs.
@@ -230,9 +232,7 @@ def comparison(
                 under[run.configs] = _RowRequests(row, run.configs)
             yield from _run(under[run.configs], demos, run, measures, retrainings, chosen)
         except UsageError as error:
-            if run.agent == run.method:
-                raise
-            raise UsageError(f"variant {run.agent!r}: {error.message}", error.hint) from None
+            raise UsageError(f"{row}, {run.agent}: {error.message}", error.hint) from None
 
 
 def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator[Task]:

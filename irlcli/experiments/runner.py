@@ -41,7 +41,7 @@ class RunConsole(Console, Protocol):
         """A line that is no warning."""
 
     def close(self) -> None:
-        """Nothing follows for now."""
+        """No more output follows for now."""
 
 
 class Silent(RunConsole):

@@ -130,7 +130,7 @@ def _argument(option: str) -> str:
 
 
 def words(command: str, options: Mapping[str, Any], *arguments: str) -> list[str]:
-    """The command line that makes the same as a call with ``options``."""
+    """The command line equivalent to a call with ``options``."""
     words = ["irl", command, *arguments]
     for name, value in options.items():
         option = "--" + name.replace("_", "-")

@@ -21,7 +21,7 @@ _SECONDS_BETWEEN_UPDATES = 0.25
 
 
 def console(quiet: bool) -> NotebookConsole | PlainConsole:
-    """What suits the place: a notebook, or else a terminal or a file."""
+    """The console for a notebook, or else for a terminal or a file."""
     return NotebookConsole(quiet) if _in_notebook() else PlainConsole(quiet)
 
 

@@ -161,7 +161,7 @@ def check_risks(name: str, grouping: str, settings: int) -> None:
     if grouping == "shuffled" and settings < 2:
         raise UsageError(
             "one setting has no labels to shuffle",
-            "collect demonstrations of another setting, or use --method irm",
+            "collect demonstrations of another setting, or use irm",
         )
     if not PENALTIES[name].compares:
         return

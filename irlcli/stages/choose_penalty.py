@@ -97,7 +97,8 @@ def _candidates(
     candidates = tuple(sorted(set(penalty.candidates if weights == "own" else weights)))
     if len(settings) < 2:
         raise UsageError(
-            f"{settings[0]} is the only setting, so none can be left out", "give --penalty-weight"
+            f"{settings[0]} is the only setting, so none can be left out",
+            "choose lambda yourself, or collect demonstrations of two other settings",
         )
     if len(candidates) < 2:
         raise UsageError(
@@ -108,7 +109,7 @@ def _candidates(
         raise UsageError(
             f"--choose-penalty leaves a setting out, and penalty {airl.penalty!r} compares at least "
             f"two of the others: {len(settings)} settings are too few",
-            "give --penalty-weight, or collect demonstrations of a third setting",
+            "choose lambda yourself, or collect demonstrations of a third setting",
         )
     if airl.select in settings:
         raise UsageError(

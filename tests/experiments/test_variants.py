@@ -174,7 +174,7 @@ def test_contradictory_options_name_the_variant(irl, tmp_path):
     path.write_text(TABLES.replace("airl.gradient_penalty=1", "airl.challenger.life=2"))
     line = ["--experiments", path, "--profile", "smoke", "--store", tmp_path / "none"]
     refused = irl("plan", "parts", *line)
-    assert refused.code == 2 and "variant 'gradient penalty': airl.challenger.life" in refused.err
+    assert refused.code == 2 and ", gradient penalty: airl.challenger.life" in refused.err
     assert len(refused.err.splitlines()) == 2
     several = irl("plan", "parts", *line, "--methods", "erm,irm")
     assert several.code == 2 and "--methods: variants" in several.err

@@ -314,7 +314,7 @@ class Submission:
             self._display.line(name, text)
 
     def _pause(self, elapsed: float) -> None:
-        """Ask Slurm seldom when jobs are long."""
+        """Poll less often the longer the jobs have run."""
         limit = time.monotonic() + min(_LONGEST_PAUSE, 0.5 + elapsed / 20)
         while time.monotonic() < limit and not self._stopped:
             time.sleep(0.1)
