@@ -90,7 +90,7 @@ def report(
             _refuse(kind, options | _of_stages(session))
             _returns(session, refs)
         case "table2":
-            _refuse(kind, options | _of_stages(session), "--format", "--profile", "--settings")
+            _refuse(kind, options | _of_stages(session), "--format")
             _table2(session, form)
         case _:
             chosen = TableChoice(kind, seeds, methods, rows, choose_penalty, file=file)

@@ -37,6 +37,7 @@ WRONG = [
     ("report returns score --from nowhere", 2, "--from"),
     ("report table2 --from nowhere", 2, "--from"),
     ("report table2 --workers 7", 2, "--workers"),
+    ("report table2 --profile smoke", 2, "--profile"),
     # Environments and interventions
     (
         "collect-experts --env lunar-lander --intervention bounce=0.1 --intervention friction=0.2",
