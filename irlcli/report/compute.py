@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -278,32 +279,36 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
     Columns: ``row``, ``agent``, ``setting``, ``seed``; ``spearman`` and ``spearman_low`` over the
     bank and over its lower half; ``expert_minus_idle`` per step; ``return_distance``; ``verdicts``
     on the policies retrained there from scratch, one for each retraining, none where the expert is
-    no better than the random agent.
+    no better than the random agent; ``uncertain``, how many of them rest on differences within
+    two standard errors.
     """
 
     def value(found: Interval | None) -> float | None:
         return None if found is None else found.value
 
-    found = [
-        {
-            "row": row.name,
-            "agent": method,
-            "setting": s.setting,
-            "seed": seed,
-            "spearman": value(s.overall.spearman),
-            "spearman_low": value(s.lower_half.spearman),
-            "expert_minus_idle": s.expert_minus_idle and s.expert_minus_idle.mean,
-            "return_distance": s.return_distance,
-            "verdicts": [r.verdict for r in of.verdicts(s.setting).values() if not r.from_student],
-        }
-        for row in p.rows
-        for method in p.methods
-        for seed in p.seeds
-        if (of := assessments.get((row.name, method, seed))) is not None
-        for s in of.settings
-    ]
+    found = []
+    for row, method, seed in product(p.rows, p.methods, p.seeds):
+        of = assessments.get((row.name, method, seed))
+        if of is None:
+            continue
+        for s in of.settings:
+            judged = [r for r in of.verdicts(s.setting).values() if not r.from_student]
+            found.append(
+                {
+                    "row": row.name,
+                    "agent": method,
+                    "setting": s.setting,
+                    "seed": seed,
+                    "spearman": value(s.overall.spearman),
+                    "spearman_low": value(s.lower_half.spearman),
+                    "expert_minus_idle": s.expert_minus_idle and s.expert_minus_idle.mean,
+                    "return_distance": s.return_distance,
+                    "verdicts": [r.verdict for r in judged],
+                    "uncertain": sum(not r.clear for r in judged),
+                }
+            )
     columns = ["row", "agent", "setting", "seed", "spearman", "spearman_low", "expert_minus_idle"]
-    return pd.DataFrame(found, columns=[*columns, "return_distance", "verdicts"])
+    return pd.DataFrame(found, columns=[*columns, "return_distance", "verdicts", "uncertain"])
 
 
 def _verdict(seed: Any, random: float) -> Verdict:

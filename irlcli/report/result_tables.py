@@ -53,9 +53,10 @@ _QUALITY_NOTE = (
     "of the demonstrations, student, experts, retrained policy): Spearman's correlation of learned "
     "with true return, over the bank and over the half with the lower true returns, median over seeds "
     "(least to largest). Expert - idle: learned reward per step, in standard deviations of g, median "
-    "over seeds. The last three count the policies retrained from scratch by verdict: retrained, if the "
+    "over seeds. The next three count the policies retrained from scratch by verdict: retrained, if the "
     "regret is within 10 % of what the expert earns above the random agent; else wrong reward, if the "
-    "policy's learned return is at least the expert's; else optimisation fell short."
+    "policy's learned return is at least the expert's; else optimisation fell short. Uncertain: verdicts on "
+    "differences within two standard errors."
 )
 _COMPARISON_NOTE = (
     "Difference of the means, with its 95 % interval by Welch's test. Detectable: the difference that "
@@ -253,10 +254,12 @@ def reward_quality(found: pd.DataFrame) -> Table:
                     f"{verdicts.count(v)}/{len(verdicts)}" if verdicts else ""
                     for v in get_args(Verdict)
                 ),
+                str(seeds["uncertain"].sum()) if verdicts else "",
             ]
         )
     columns = ["row", "setting", "method", "seeds", "Spearman", "lower half", "expert - idle"]
-    return Table(REWARD_QUALITY, _QUALITY_NOTE, [*columns, *get_args(Verdict)], lines, heads=3)
+    columns += [*get_args(Verdict), "uncertain"]
+    return Table(REWARD_QUALITY, _QUALITY_NOTE, columns, lines, heads=3)
 
 
 def _spread(values: pd.Series) -> str:

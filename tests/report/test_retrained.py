@@ -143,6 +143,13 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
     p, points = example(complete())
     report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): assessment})
     assert report.reward_quality["verdicts"].tolist() == [["retrained"]]
+    assert report.reward_quality["uncertain"].tolist() == [0]
+    # A regret of 18 is short of the bar of 20 by 2, which is within two standard errors, sqrt(2) each.
+    members[3] = member("begun as a student", "retrained", 82.0)
+    close = assess("lunar-lander", reward, members, {})
+    report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): close})
+    assert report.reward_quality["uncertain"].tolist() == [1]
+    assert column(table(report, "Reward quality"), "uncertain") == ["1"]
     # Beside an expert that earns no more than the random agent, a verdict says nothing.
     members[1] = member("random", "random", 100.0)
     weak = assess("lunar-lander", reward, members, {})
