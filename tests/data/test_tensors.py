@@ -1,6 +1,7 @@
 """Tensor files: round trips, equal bytes, and files that do not fit are named."""
 
 import shutil
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -14,6 +15,8 @@ from irlcli.data.tensors import (
     to_bytes,
 )
 from irlcli.errors import IntegrityError, NewerFormat, StageFailed, UsageError
+from irlcli.experiments.runner import Silent
+from irlcli.stages.base import Job, run_training
 
 LOADERS = {"reward": load_reward_file, "policy": load_policy_file}
 
@@ -100,3 +103,80 @@ def test_only_a_checkpoint_that_does_not_fit_is_called_so(tmp_path, raised, repo
     """Too little memory says nothing about the checkpoint."""
     with pytest.raises(reported), fitting(tmp_path):
         raise raised
+
+
+class LongTraining:
+    """As much of a training as :func:`run_training` asks for: the metrics of very many rounds."""
+
+    ROW: ClassVar[dict] = {
+        "round": 10**6,
+        "setting": "mass=0.5x",
+        "true_return": 1 / 3,
+        "progress": float("nan"),
+    }
+
+    def __init__(self, rows: int):
+        self.rows = [self.ROW] * rows
+        self.steps = self.planned_steps = 1
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"steps": 1}
+
+    def load_state_dict(self, state: dict[str, Any], rows: list[dict]) -> None:
+        assert state == {"steps": 1}
+        self.rows = rows
+
+    def run(self, after_round, warn) -> list[dict]:
+        after_round(self, self.rows[-1:])
+        return self.rows
+
+
+class Saved:
+    """Checkpoints in memory."""
+
+    data: bytes | None = None
+
+    def load(self) -> bytes | None:
+        return self.data
+
+    def discard(self, reason: str) -> None:
+        raise AssertionError(reason)
+
+    def offer(self, state) -> None:
+        self.data = state()
+
+
+def test_the_metrics_of_a_long_run_fit_into_its_checkpoint(tmp_path):
+    """Paper budgets of many settings and rounds: the index of a tensor file is capped at 4 MiB."""
+    saved = Saved()
+    job = Job(None, {}, tmp_path / "key" / "out", saved, Silent())
+    rows = run_training(job, LongTraining(100_000))
+    assert len(saved.data) > 8 << 20
+    restored = run_training(job, LongTraining(0))
+    assert len(restored) == len(rows) and repr(restored[-1]) == repr(LongTraining.ROW)
+
+
+def test_a_checkpoint_larger_than_a_foreign_file_may_be_is_read():
+    """Nothing unpacks to more than was read, so its size alone is no reason to refuse it."""
+    state = {"past": torch.zeros((257 << 20) // 8, dtype=torch.float64)}
+    data = to_bytes(state)
+    del state
+    assert len(from_bytes(data)["past"]) == (257 << 20) // 8
+
+
+def test_running_out_of_memory_says_nothing_about_a_file(irl, store_copy, tmp_path, monkeypatch):
+    def exhausted(*_, **__):
+        raise MemoryError
+
+    data = to_bytes({"x": torch.zeros(3)})
+    monkeypatch.setattr(torch, "load", exhausted)
+    with pytest.raises(MemoryError):
+        from_bytes(data)
+    (tmp_path / "reward.pt").write_bytes(data)
+    result = irl(
+        *("transfer", "--reward", tmp_path / "reward.pt", "--ood", "2x"),
+        *("--store", store_copy.path),
+    )
+    assert result.code == 1
+    assert "error: out of memory" in result.err and "hint: " in result.err
+    assert "defect" not in result.err and "not a file of a reward" not in result.err
