@@ -80,7 +80,7 @@ def table_file(place: Path, runs: int) -> Path:
 
 def open_plan(file: Path, store: Store) -> Plan:
     def load(env, flags, overrides):
-        return load_config(env, "smoke", None, overrides, flags)
+        return load_config(env, "smoke", (), overrides, flags)
 
     return Plan(load_table("big", file), Selection("smoke"), load, Lookup(store))
 

@@ -47,7 +47,7 @@ def main() -> None:
 
 def load(env, flags, overrides):
     """The config of ``env``, as ``irl run`` loads it."""
-    return load_config(env, PROFILE, None, overrides, flags)
+    return load_config(env, PROFILE, (), overrides, flags)
 
 
 def add_report(plan: Plan, store: Store) -> None:

@@ -1,8 +1,8 @@
 """Configs from TOML files, profiles and ``--set``.
 
 One file per environment in ``settings/``. Precedence, weakest first: the schema's defaults, the
-environment's file, its profile, ``--settings FILE``, ``--set``, flags. Environment variables are
-not read, so equal configs give equal artefacts wherever they run.
+environment's file, its profile, a table's file, ``--settings FILE``, ``--set``, flags. Environment
+variables are not read, so equal configs give equal artefacts wherever they run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ def check_profile(profile: str, source: str = "") -> None:
 def load_config(
     env: str,
     profile: str = "standard",
-    file: Path | None = None,
+    files: Sequence[Path] = (),
     overrides: Sequence[str] = (),
     flags: Mapping[str, Any] | None = None,
 ) -> Config:
@@ -59,8 +59,8 @@ def load_config(
     Args:
         env: environment whose file in ``settings/`` is read, or :data:`CONTROL`.
         profile: ``smoke``, ``standard`` or ``paper``.
-        file: a TOML file of the same form, laid over the profile. Its own section for the
-            profile, ``[profiles.smoke]`` say, is laid over the rest of it.
+        files: TOML files of the same form, laid over the profile one after the other. A file's
+            own section for the profile, ``[profiles.smoke]`` say, is laid over the rest of it.
         overrides: ``airl.penalty_weight=30``, each typed by its field.
         flags: dotted field to value; None is left out.
 
@@ -76,7 +76,7 @@ def load_config(
     else:
         own, tree = known.source, known.settings
     layers = in_profile(own, tree, profile)
-    if file is not None:
+    for file in files:
         layers += in_profile(str(file), read_toml(file), profile)
     nested = [(item, _override(item)) for item in overrides]
     _check_set_once(nested, flags or {})

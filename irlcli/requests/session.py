@@ -117,7 +117,7 @@ class StageSession(Session):
         super().__init__(store, console, wait, read_only)
         self.profile = profile
         self.file = file
-        # Settings file of a table, which the session's own file replaces.
+        # Settings file of a table; the session's own file is laid over it.
         self.table_file: Path | None = None
         self.overrides = list(overrides)
         self.asked = self.overrides if asked is None else list(asked)
@@ -140,8 +140,8 @@ class StageSession(Session):
             self.console.warn(
                 f"{source} has no [profiles.{self.profile}]: its values outside [profiles] are used"
             )
-        file = self.file or self.table_file
-        return load_config(env, self.profile, file, [*self.overrides, *overrides], flags)
+        files = [file for file in (self.table_file, self.file) if file is not None]
+        return load_config(env, self.profile, files, [*self.overrides, *overrides], flags)
 
     def config_words(self) -> list[str]:
         """The options that give another command line the same configs."""

@@ -70,7 +70,7 @@ def test_every_file_is_an_environments_or_the_experiments():
 
 @pytest.mark.parametrize("path", sorted(SETTINGS.glob("*/*.toml")), ids=lambda p: p.parent.name)
 def test_every_shipped_overlay_loads(path):
-    assert load_config(path.stem, "standard", path) != load_config(path.stem, "standard")
+    assert load_config(path.stem, "standard", [path]) != load_config(path.stem, "standard")
 
 
 def test_profiles_differ_and_smoke_is_small():
@@ -91,12 +91,12 @@ def test_defaults_file_profile_settings_flags_and_set(toml):
     mine = toml(
         "[expert]\ntotal_steps = 5000\n[airl]\npenalty_weight = 5\ngrouping = 'per-setting'"
     )
-    loaded = load_config(LANDER, "smoke", mine)
+    loaded = load_config(LANDER, "smoke", [mine])
     assert (loaded.expert.total_steps, loaded.airl.penalty_weight) == (5000, 5.0)
-    loaded = load_config(LANDER, "smoke", mine, ["expert.total_steps=6000"])
+    loaded = load_config(LANDER, "smoke", [mine], ["expert.total_steps=6000"])
     assert loaded.expert.total_steps == 6000
     loaded = load_config(
-        LANDER, "smoke", mine, [], {"airl.penalty_weight": 7.0, "airl.grouping": None}
+        LANDER, "smoke", [mine], [], {"airl.penalty_weight": 7.0, "airl.grouping": None}
     )
     assert (loaded.airl.penalty_weight, loaded.airl.grouping) == (7.0, "per-setting")
 
@@ -106,7 +106,7 @@ def test_a_settings_file_has_profiles_too(toml):
         "[profiles.smoke.airl]\npenalty_weight = 3\n"
         "[airl]\npenalty_weight = 5\ngrouping = 'per-setting'"
     )
-    loaded = [load_config(LANDER, profile, mine).airl for profile in ("smoke", "standard")]
+    loaded = [load_config(LANDER, profile, [mine]).airl for profile in ("smoke", "standard")]
     assert [airl.penalty_weight for airl in loaded] == [3.0, 5.0]
     assert {airl.grouping for airl in loaded} == {"per-setting"}
 
@@ -118,7 +118,7 @@ def test_the_later_set_wins():
 
 def test_a_layer_changes_only_what_it_names(toml):
     before = load_config("reacher", "paper")
-    after = load_config("reacher", "paper", toml("[airl.ppo]\nn_envs = 3"))
+    after = load_config("reacher", "paper", [toml("[airl.ppo]\nn_envs = 3")])
     assert after.airl.ppo.n_envs == 3
     restored = msgspec.structs.replace(after.airl.ppo, n_envs=before.airl.ppo.n_envs)
     airl = msgspec.structs.replace(after.airl, ppo=restored)
@@ -131,7 +131,7 @@ def test_a_knob_has_experts_of_its_own(toml):
         "[expert.ppo]\nn_epochs = 3\ngamma = 0.5\n"
         "[interventions.bounce.expert.ppo]\nn_epochs = 7\nuse_sde = true"
     )
-    config = load_config(LANDER, "smoke", mine, ["expert.ppo.gamma=0.25"])
+    config = load_config(LANDER, "smoke", [mine], ["expert.ppo.gamma=0.25"])
     bounce, power = (
         config.expert_of(parse_settings(LANDER, text)[0])
         for text in ("bounce=0.1", "engine-power=1x")
@@ -140,12 +140,12 @@ def test_a_knob_has_experts_of_its_own(toml):
     assert (power.ppo.n_epochs, power.ppo.gamma) == (3, 0.25)
     changed = msgspec.structs.replace(config.expert.ppo, n_epochs=7, use_sde=True)
     assert bounce == msgspec.structs.replace(config.expert, ppo=changed)
-    later = load_config(LANDER, "smoke", mine, ["expert.ppo.n_epochs=9"])
+    later = load_config(LANDER, "smoke", [mine], ["expert.ppo.n_epochs=9"])
     assert later.expert_of(parse_settings(LANDER, "bounce=0.1")[0]).ppo.n_epochs == 9
 
 
 def test_an_empty_file_changes_nothing(toml):
-    assert load_config(LANDER, "smoke", toml("")) == load_config(LANDER, "smoke")
+    assert load_config(LANDER, "smoke", [toml("")]) == load_config(LANDER, "smoke")
 
 
 def test_environment_variables_never_enter(monkeypatch):
@@ -160,7 +160,7 @@ def test_however_written_it_is_one_value_and_so_one_key(toml, text):
     """An int in TOML, a float on the command line: equal settings must give equal artefacts."""
     expected = load_config(LANDER, flags={"airl.penalty_weight": 30.0})
     from_set = load_config(LANDER, overrides=[f"airl.penalty_weight={text}"])
-    from_file = load_config(LANDER, file=toml(f"[airl]\npenalty_weight = {text}"))
+    from_file = load_config(LANDER, files=[toml(f"[airl]\npenalty_weight = {text}")])
     forms = {canonical_json(msgspec.to_builtins(s)) for s in (expected, from_set, from_file)}
     assert len(forms) == 1
 
@@ -184,7 +184,7 @@ def test_a_field_that_an_option_sets_to_another_value_is_refused(item, flags):
 
 def test_names_in_sections_of_one_knob_are_checked(toml):
     for text in ("airl]\npenalty = 'nope'", "transfer]\nalgorithm = 'nope'"):
-        error = refused("smoke", toml(f"[interventions.bounce.{text}"))
+        error = refused("smoke", [toml(f"[interventions.bounce.{text}")])
         assert "interventions.bounce." in error.message and "nope" in error.message
 
 
@@ -273,7 +273,7 @@ def test_numbers_that_no_key_can_hold_are_refused(toml, field, text):
     assert field in refused(overrides=[f"{field}={text}"]).message
     group, _, name = field.rpartition(".")
     path = toml(f"[{group}]\n{name} = {text}")
-    error = refused(file=path)
+    error = refused(files=[path])
     assert str(path) in error.message and field in error.message
     error = refused(flags={field: float(text)})
     assert name.replace("_", "-") in error.message
@@ -299,13 +299,13 @@ def test_numbers_that_no_key_can_hold_are_refused(toml, field, text):
 )
 def test_malformed_toml_names_the_file(toml, text):
     path = toml(text)
-    error = refused(file=path)
+    error = refused(files=[path])
     assert str(path) in error.message and "TOML" in error.message
 
 
 def test_files_that_cannot_be_read(tmp_path):
     for path in (tmp_path / "absent.toml", tmp_path):
-        error = refused(file=path)
+        error = refused(files=[path])
         assert str(path) in error.message and "--settings" in error.hint
 
 
@@ -371,7 +371,7 @@ def test_files_that_cannot_be_read(tmp_path):
 )
 def test_a_wrong_file_is_named_with_the_field(toml, text, named, hint):
     path = toml(text)
-    error = refused(file=path)
+    error = refused(files=[path])
     assert str(path) in error.message
     assert named in error.message
     assert hint in error.hint
@@ -380,15 +380,15 @@ def test_a_wrong_file_is_named_with_the_field(toml, text, named, hint):
 def test_the_layer_at_fault_is_named_not_an_innocent_one(toml):
     """A file may complete what it overrides only in part."""
     path = toml("[interventions.engine-power]\nood = ['2x']")
-    assert load_config(LANDER, file=path).interventions["engine-power"].ood == ("2x",)
-    error = refused(file=path, flags={"airl.grouping": "all"})
+    assert load_config(LANDER, files=[path]).interventions["engine-power"].ood == ("2x",)
+    error = refused(files=[path], flags={"airl.grouping": "all"})
     assert "--grouping" in error.message and "all" in error.message
     assert str(path) not in error.message
 
 
 def test_a_later_layer_does_not_hide_what_is_wrong(toml):
     path = toml("expert = 3")
-    assert str(path) in refused(file=path, overrides=["expert.total_steps=5000"]).message
+    assert str(path) in refused(files=[path], overrides=["expert.total_steps=5000"]).message
 
 
 def test_flags_are_named_as_they_are_written():
@@ -452,7 +452,7 @@ def test_any_file_is_taken_or_refused(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "any.toml"
     path.write_bytes(data)
     try:
-        settings = load_config(LANDER, file=path)
+        settings = load_config(LANDER, files=[path])
     except UsageError as error:
         assert str(path) in error.message and error.hint
     else:
@@ -484,14 +484,14 @@ def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
     rounds = airl.ppo.rounds(airl.total_steps)
     assert 2 * airl.challenger.life == rounds and airl.averaged_rounds <= rounds
     assert config.airl_of([legs]).challenger.ppo.use_sde
-    own = load_config("ant", file=toml("[airl.challenger.ppo]\nuse_sde = false"))
+    own = load_config("ant", files=[toml("[airl.challenger.ppo]\nuse_sde = false")])
     assert not own.airl_of([legs]).challenger.ppo.use_sde and own.transfer_of(legs).ppo.use_sde
     assert own.airl_of([legs]).challenger.ppo.activation == "relu"
 
 
 def test_a_knob_has_rewards_of_its_own(toml):
     mine = toml("[interventions.bounce.airl]\nbatch_size = 64\n[airl]\nbc_epochs = 7")
-    config = load_config(LANDER, file=mine, overrides=["airl.hidden=[8]"])
+    config = load_config(LANDER, files=[mine], overrides=["airl.hidden=[8]"])
     bounce, power = (
         config.airl_of(parse_settings(LANDER, text)) for text in ("bounce=0.1", "engine-power=1x")
     )
@@ -547,7 +547,7 @@ def test_none_unsets_a_field_that_the_settings_set(toml):
     assert listed.averaged_rounds == 30
     for source in (
         {"overrides": ["airl.averaged_rounds=none"]},
-        {"file": toml('[airl]\naveraged_rounds = "none"')},
+        {"files": [toml('[airl]\naveraged_rounds = "none"')]},
     ):
         found = load_config("ant", **source).airl_of([friction])
         assert found == msgspec.structs.replace(listed, averaged_rounds=msgspec.UNSET)
@@ -557,16 +557,18 @@ def test_none_unsets_a_field_that_the_settings_set(toml):
 
 def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):
     assert load_config(LANDER).transfer.ceiling == 0.9
-    assert load_config(LANDER, file=toml('[transfer]\nceiling = "none"')).transfer.ceiling is None
+    assert (
+        load_config(LANDER, files=[toml('[transfer]\nceiling = "none"')]).transfer.ceiling is None
+    )
     lifted = toml(
         '[interventions.bounce]\nid = ["0.1"]\n[interventions.bounce.transfer]\nceiling = "none"'
     )
     (bounce,) = parse_settings(LANDER, "bounce=0.1")
     assert load_config(LANDER).transfer_of(bounce).ceiling == 0.9
-    assert load_config(LANDER, file=lifted).transfer_of(bounce).ceiling is None
-    assert "airl.hidden" in refused(file=toml('[airl]\nhidden = "none"')).message
+    assert load_config(LANDER, files=[lifted]).transfer_of(bounce).ceiling is None
+    assert "airl.hidden" in refused(files=[toml('[airl]\nhidden = "none"')]).message
     whole = toml('[interventions.bounce]\nid = ["0.1"]\ntransfer = "none"')
-    assert "'none'" in refused(file=whole).message
+    assert "'none'" in refused(files=[whole]).message
 
 
 def test_an_eps_that_is_the_default_is_no_other_key():
@@ -602,6 +604,6 @@ def test_a_later_count_of_demonstrations_wins_over_a_knobs_own(tmp_path):
     assert counts(overrides=["demonstrations.episodes=4"]) == ()
     file = tmp_path / "mine.toml"
     file.write_text("[demonstrations]\nepisodes = 4\n")
-    assert counts(file=file) == ()
+    assert counts(files=[file]) == ()
     file.write_text("[demonstrations]\nepisodes = 4\n[interventions.goal-y]\nepisodes = [5, 1]\n")
-    assert counts(file=file) == (5, 1)
+    assert counts(files=[file]) == (5, 1)

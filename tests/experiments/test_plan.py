@@ -125,6 +125,21 @@ def test_profiles_of_a_table_with_settings_of_its_own_share_no_name(irl, tmp_pat
     assert all(name.startswith("demo.") for name in named[1])
 
 
+@pytest.mark.parametrize(
+    ("text", "experts"),
+    [
+        ("[airl]\nbc_epochs = 3", ["0.1", "0.2", "0.3", "0.4", "0.5", "0.9"]),
+        ('[interventions.bounce]\nid = ["0.1", "0.3"]\nood = ["0.8"]', ["0.1", "0.3", "0.8"]),
+    ],
+)
+def test_a_settings_file_is_laid_over_that_of_the_table(irl, tmp_path, text, experts):
+    (tmp_path / "own.toml").write_text(text)
+    line = ["plan", "table1-5", "--rows", "lunar-lander.bounce", "--until", "experts", "--tag", "x"]
+    done = irl(*line, "--settings", tmp_path / "own.toml", "--store", tmp_path / "none", "--json")
+    names = [step["name"] for step in json.loads(done.out)["steps"]]
+    assert names == [f"x.lunar-lander.bounce.expert.{value}" for value in experts]
+
+
 def test_what_exists_is_a_hit_whoever_made_it(plan, smoke_store):
     """The chain of plain commands gives the artefacts that the table asks for."""
     steps = plan(smoke_store.path)

@@ -116,7 +116,7 @@ def test_none_removes_the_ceiling(tmp_path, knob_has_its_own):
     file.write_text(f"[{table}]\nceiling = 0.9\n")
 
     def ceiling(*overrides):
-        config = load_config("lunar-lander", "smoke", file, overrides)
+        config = load_config("lunar-lander", "smoke", [file], overrides)
         own = config.interventions["engine-power"].transfer
         return (own or config.transfer).ceiling
 

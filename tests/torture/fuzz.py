@@ -80,7 +80,7 @@ def settings_files(place: Path) -> Target:
 
     def read(data: bytes) -> None:
         (place / "settings.toml").write_bytes(data)
-        load_config("gridworld", file=place / "settings.toml")
+        load_config("gridworld", files=[place / "settings.toml"])
 
     demo = Path(PACKAGE).parent / "settings" / "demo" / "lunar-lander.toml"
     seeds = [
