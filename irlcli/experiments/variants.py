@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from irlcli.configs import Config
-from irlcli.configs.load import overridden
+from irlcli.configs.load import field_of, overridden
 from irlcli.errors import UsageError, suggest
 from irlcli.methods import METHODS, fields
 from irlcli.report.agents import BASELINES
@@ -108,7 +108,7 @@ def configs_of(variant: Variant, load: Overridable) -> Configs:
     Challengers learn as ``[transfer.ppo]`` says. Still, what a variant changes in ``transfer``
     leaves reward learning alone: such variants share the rewards of the base.
     """
-    learning = [item for item in variant.overrides if item.startswith("airl.")]
+    learning = [item for item in variant.overrides if field_of(item).startswith("airl.")]
 
     def configs(env: str, flags: Mapping[str, Any] | None) -> Config:
         config, learned = load(env, flags, variant.overrides), load(env, flags, learning)

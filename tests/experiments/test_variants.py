@@ -68,6 +68,12 @@ def test_variants_share_what_they_do_not_change(plan):
     assert {"demos", "expert.1x", "expert.1.25x", "random-returns"} <= set(steps)
 
 
+def test_a_space_before_a_field_changes_nothing(plan, tmp_path):
+    path = tmp_path / "tables.toml"
+    path.write_text(TABLES.replace('"airl.', '" airl.'))
+    assert plan("--seeds", "0", file=path).keys() == plan("--seeds", "0").keys()
+
+
 def test_retraining_options_leave_rewards_that_know_challengers_alone(irl, tmp_path):
     """Challengers learn as retrained policies do; a variant's options are not theirs."""
     path = tmp_path / "tables.toml"
