@@ -184,7 +184,7 @@ def run_jobs(
     impatient = ["--no-wait"] if session.wait and queue.starts_what_waits else []
 
     def command(name: str) -> list[str]:
-        return [sys.executable, "-m", "irlcli", *words(name), *impatient]
+        return [sys.executable, "-P", "-m", "irlcli", *words(name), *impatient]
 
     display = job_display(session.console)
     requeues = DEFAULT_REQUEUES if queue.starts_what_waits else LOCAL_REQUEUES

@@ -301,7 +301,8 @@ def _make_all(
     display = job_display(session.console)
 
     def command(name: str) -> list[str]:
-        return [sys.executable, "-m", "irlcli", *words(name)]
+        # -P: as for the script `irl`, the working directory is not on Python's path.
+        return [sys.executable, "-P", "-m", "irlcli", *words(name)]
 
     try:
         return Execution(plan, runner, command, jobs, display).run()

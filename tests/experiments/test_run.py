@@ -49,7 +49,7 @@ class Runs:
         self.words = ["run", "tiny", "--experiments", str(self.tables), "--profile", "smoke"]
 
     def start(self, store: Path, *more: object, **environment: str) -> subprocess.Popen:
-        line = [sys.executable, "-m", "irlcli", *self.words, "--store", store, *more]
+        line = [sys.executable, "-P", "-m", "irlcli", *self.words, "--store", store, *more]
         fakes = str(Path(__file__).parent / "fake_stages")
         path = os.pathsep.join([fakes, *filter(None, [os.environ.get("PYTHONPATH")])])
         return subprocess.Popen(
@@ -142,6 +142,16 @@ def test_what_exists_needs_no_process(uninterrupted, runs):
     document = json.loads(process.communicate(timeout=600)[0])
     assert (document["kind"], document["existed"], document["made"]) == ("run", 6, 0)
     assert runs.processes() == [] and earlier.log.read_bytes() == before
+
+
+@pytest.mark.parametrize("more", [[], ["--cluster", "local"]])
+def test_nothing_is_imported_from_the_working_directory(runs, tmp_path, monkeypatch, more):
+    if more:
+        pytest.importorskip("submitit")
+    for name in ("queue", "typer"):
+        (tmp_path / f"{name}.py").write_text(f"raise RuntimeError('this is not {name}')")
+    monkeypatch.chdir(tmp_path)
+    runs.run(tmp_path / "runs", "--until", "experts", "--jobs", "3", *more)
 
 
 def test_killed_and_started_again_it_ends_in_the_same_artefacts(uninterrupted, runs, tmp_path):

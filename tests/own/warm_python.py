@@ -53,8 +53,8 @@ def _run(connection):
     sys.executable = python
     code = 0
     try:
-        if words[:2] == ["-m", "irlcli"]:
-            sys.argv = ["irl", *words[2:]]
+        if "irlcli" in words[:3]:
+            sys.argv = ["irl", *words[words.index("irlcli") + 1 :]]
             from irlcli.cli.main import main
 
             main()

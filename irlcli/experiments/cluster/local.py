@@ -34,6 +34,8 @@ class Local:
         import submitit
 
         assert not after and matching is None, "the local executor knows no dependencies"
+        # submitit's own processes must not import from the working directory, either.
+        os.environ["PYTHONSAFEPATH"] = "1"
         executor = submitit.LocalExecutor(folder=logs)
         executor.update_parameters(
             timeout_min=self._resources.minutes, signal_delay_s=self._resources.warning

@@ -91,7 +91,7 @@ class Slurm:
         more |= self._resources.extra
         # Without srun: a node that dies while srun launches a task would end the job as failed
         # instead of putting it back into the queue.
-        executor = submitit.SlurmExecutor(logs, python=f"exec {shlex.quote(sys.executable)}")
+        executor = submitit.SlurmExecutor(logs, python=f"exec {shlex.quote(sys.executable)} -P")
         executor.update_parameters(
             job_name=JOB_NAME,
             partition=self._resources.partition,
@@ -159,6 +159,7 @@ class Slurm:
         command += [
             *self._resources.words(),
             sys.executable,
+            "-P",
             "-m",
             "irlcli.experiments.cluster.probe",
         ]
