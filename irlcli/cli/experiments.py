@@ -12,7 +12,7 @@ from irlcli.cli import cluster as cluster_jobs
 from irlcli.cli import complete
 from irlcli.cli import console as out
 from irlcli.cli.cluster import ClusterOptions
-from irlcli.cli.options import planning_command, stage_command
+from irlcli.cli.options import Out, planning_command, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
@@ -134,9 +134,7 @@ def run(
     only: _Only = None,
     tag: _Tag = None,
     experiments: TableFile = None,
-    directory: Annotated[
-        Path | None, typer.Option("--out", help="Directory to copy the report's files to.")
-    ] = None,
+    directory: Out = None,
     cluster: Annotated[
         str | None,
         typer.Option(help="Make the steps as jobs: slurm, or local.", rich_help_panel=_JOBS),
@@ -217,6 +215,8 @@ def run(
         )
     runner = session.runner()
     plan = open_plan(session, choice)
+    if directory is not None:
+        check_out(directory, session.store.root, plan.table)
     if session.dry_run:
         _print_plan(session, choice, plan)
         return
@@ -270,8 +270,6 @@ def _check_options(
         raise UsageError("--only cannot be combined with --cluster", "omit one of them")
     if detach and directory is not None:
         raise UsageError("--detach makes no report, so --out has no files", "omit one of them")
-    if directory is not None:
-        check_out(directory, session.store.root)
 
 
 def _make_one(session: StageSession, runner: "Runner", plan: "Plan", only: str) -> None:

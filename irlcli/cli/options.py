@@ -33,7 +33,31 @@ OneSetting = Annotated[
     ),
 ]
 
-_Store = Annotated[Path, typer.Option(envvar="IRL_STORE", help="Artefact store.")]
+
+def directory(text: str) -> Path:
+    """The directory that an option names.
+
+    Raises:
+        BadParameter: no text, which as a path would be the working directory.
+    """
+    if not text:
+        raise typer.BadParameter("the path is empty")
+    return Path(text)
+
+
+_Store = Annotated[
+    Path,
+    typer.Option(envvar="IRL_STORE", help="Artefact store.", parser=directory, metavar="PATH"),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        help="Directory to copy the report's files to.",
+        parser=directory,
+        metavar="PATH",
+    ),
+]
 _Json = Annotated[bool, typer.Option("--json", help="Print versioned JSON on stdout.")]
 _Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
@@ -75,7 +99,12 @@ def _stage_session(
     workers: Annotated[int, typer.Option(min=1, help="Processes that step environments.")] = 1,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on stderr.")] = False,
     tensorboard: Annotated[
-        Path | None, typer.Option(help="Also write the metrics to this TensorBoard directory.")
+        Path | None,
+        typer.Option(
+            help="Also write the metrics to this TensorBoard directory.",
+            parser=directory,
+            metavar="PATH",
+        ),
     ] = None,
     store: _Store = DEFAULT_STORE,
     as_json: _Json = False,

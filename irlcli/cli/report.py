@@ -15,7 +15,7 @@ from irlcli.cli.experiments import (
     Seeds,
     TableFile,
 )
-from irlcli.cli.options import Name, sources_of_environment, stage_command
+from irlcli.cli.options import Name, Out, sources_of_environment, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import (
     check_out,
@@ -60,9 +60,7 @@ def report(
         ),
     ] = None,
     file: TableFile = None,
-    directory: Annotated[
-        Path | None, typer.Option("--out", help="Directory to copy the report's files to.")
-    ] = None,
+    directory: Out = None,
     name: Name = None,
 ) -> None:
     """Print or write a table or figure from stored results.
@@ -124,9 +122,9 @@ def _table(
     session: StageSession, chosen: TableChoice, name: str | None, directory: Path | None
 ) -> None:
     """The report on a table of ``settings/experiments.toml``, from what exists."""
-    if directory is not None:
-        check_out(directory, session.store.root)
     plan = open_plan(session, chosen)
+    if directory is not None:
+        check_out(directory, session.store.root, plan.table)
     request = report_of(session, chosen, plan)
 
     def details(artefact: Artefact) -> dict[str, Any]:

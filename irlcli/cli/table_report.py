@@ -15,6 +15,7 @@ from irlcli.store import Artefact, read_json
 
 if TYPE_CHECKING:
     from irlcli.experiments.plan import Plan
+    from irlcli.experiments.tables import Table
     from irlcli.stages.base import Request
 
 
@@ -51,16 +52,22 @@ def _run_line(session: StageSession, choice: TableChoice) -> str:
     return session.suggestion("run", choice.table, *choice.words(), *tag)
 
 
-def check_out(directory: Path, store: Path) -> None:
-    """Refuse a directory for a report's files before any work is done.
+def check_out(directory: Path, store: Path, table: "Table") -> None:
+    """Refuse a directory for the files of a report on ``table`` before any work is done.
 
     Raises:
-        UsageError: it is a file, or lies in the store.
+        UsageError: it is a file, lies in the store, or has a README.md of something else.
     """
     if directory.exists() and not directory.is_dir():
         raise UsageError(f"--out {directory} is not a directory", "name a directory")
     if directory.resolve().is_relative_to(store.resolve()):
         raise UsageError(f"--out {directory} lies in the store", "name another directory")
+    numbers = directory / f"{table.name if table.kind == 'comparison' else table.kind}.csv"
+    if (directory / "README.md").exists() and not numbers.exists():
+        raise UsageError(
+            f"--out {directory} has a README.md that is not from a report on {table.name}",
+            f"name another directory: {numbers.name} would lie beside the README.md of such a report",
+        )
 
 
 def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> None:
@@ -70,7 +77,8 @@ def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> 
         StageFailed: the directory cannot be written.
     """
     try:
-        for output in artefact.manifest.outputs:
+        # README.md last: check_out takes it for a report's if the others lie beside it.
+        for output in sorted(artefact.manifest.outputs, key=lambda one: one.path == "README.md"):
             target = directory / output.path
             target.parent.mkdir(parents=True, exist_ok=True)
             # Whole or absent, also if this process is killed.

@@ -104,6 +104,15 @@ def test_a_reference_is_not_looked_up_in_a_store_that_does_not_exist(irl, tmp_pa
     assert done.code == 3 and f"no store at {tmp_path / 'rnus'}" in done.err
 
 
+def test_no_text_is_not_taken_for_the_working_directory(irl, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = irl(
+        "evaluate", "--idle", "--env", "lunar-lander", *BOUNCE.split(), *SMOKE, "--store", ""
+    )
+    assert done.code == 2 and "--store" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_url_is_not_taken_for_a_directory(irl, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     line = ["evaluate", "--idle", "--env", "lunar-lander", *SMOKE, "--store", "s3://bucket/runs"]

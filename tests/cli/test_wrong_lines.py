@@ -38,6 +38,7 @@ WRONG = [
     ("report table2 --from nowhere", 2, "--from"),
     ("report table2 --workers 7", 2, "--workers"),
     ("report table2 --profile smoke", 2, "--profile"),
+    (f"evaluate --idle {LANDER} --tensorboard ''", 2, "--tensorboard"),
     # Environments and interventions
     (
         "collect-experts --env lunar-lander --intervention bounce=0.1 --intervention friction=0.2",

@@ -218,6 +218,10 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     (tmp_path / "file").touch()
     assert "is not a directory" in refused("run", "demo", "--out", tmp_path / "file")
     assert "lies in the store" in refused("run", "demo", "--out", tmp_path / "runs" / "out")
+    (tmp_path / "README.md").touch()
+    for command in ("report", "run"):
+        assert "has a README.md" in refused(command, "demo", "--out", tmp_path)
+        assert "--out" in refused(command, "demo", "--out", "")
     assert "--until makes no report" in refused("run", "demo", "--until", "demos", "--out", "x")
     assert "--only takes no --until" in refused("run", "demo", "--only", "x", "--until", "demos")
     assert "--choose-penalty" in refused("run", "experts", "--choose-penalty", "1,2", "--tag", "x")
