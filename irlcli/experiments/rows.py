@@ -9,7 +9,7 @@ A task's name is that of its row and what it makes::
     ROW.METHOD.SEED.zero-shot-returns  ....id-returns  ....transfer-returns  ....expert-by-reward
     ROW.METHOD.SEED.from-student  ....from-student-returns
     ROW.METHOD.SEED.transfer-id.VALUE  ....transfer-id.VALUE-returns
-    ROW.METHOD.SEED.transfer.1  ....transfer.1-returns  ...      further retrainings
+    ROW.METHOD.SEED.transfer-1  ....transfer-1-returns  ...      further retrainings
     ROW.VARIANT.METHOD.SEED...                                   of tables with variants
     ROW.METHOD.SEED.choice                                       lambda, with --choose-penalty
     ROW.METHOD.SEED.cue
@@ -404,7 +404,8 @@ def _retrained(
     cell = reward.cell(measure, str(place) if in_distribution else "", retraining=retraining)
     name = f"{reward.run.name}.{measure}"
     name += f".{_value(place)}" if in_distribution else ""
-    name += f".{retraining}" if retraining else ""
+    # No dot: the policy of 0 that is retrained again is not that of 0.1.
+    name += f"-{retraining}" if retraining else ""
     yield Task(name, "transfers", moved)
     config = moved.parameters.transfer
     how = labels.retrained(

@@ -226,13 +226,27 @@ def test_each_measure_of_a_retrained_policy_has_its_own_steps(irl, tmp_path):
     policies = [
         f"irm.0.{what}{again}"
         for what in ("transfer", "from-student", "transfer-id.1x", "transfer-id.1.25x")
-        for again in ("", ".1")
+        for again in ("", "-1")
     ]
     for name in policies:
         assert steps[name]["needs"] == [f"{ROW}.irm.0"]
         assert steps[f"{name}-returns"]["needs"] == [f"{ROW}.{name}", f"{ROW}.irm.0"]
     assert {"expert.1x.returns", "expert.1.25x.returns"} <= set(steps)
     assert sum(".transfer" in name or ".from-student" in name for name in steps) == 16
+
+
+def test_a_value_and_a_retraining_of_another_value_are_two_names(irl, tmp_path):
+    tables, own = tmp_path / "tables.toml", tmp_path / "own.toml"
+    own.write_text('[interventions.bounce]\nid = ["0", "0.1"]\nood = ["0.9"]\n')
+    text = TABLES.replace('["transfer"]', '["transfer-id"]\nretrainings = 2\nsettings = "own.toml"')
+    tables.write_text(text.replace("engine-power", "bounce"))
+    done = irl("plan", "tiny", "--experiments", tables, "--store", tmp_path / "none", "--json")
+    assert done.code == 0, done.err
+    names = [step["name"] for step in json.loads(done.out)["steps"]]
+    row = "tiny.lunar-lander.bounce.irm.0.transfer-id"
+    assert [name for name in names if name.startswith(row) and "returns" not in name] == [
+        *(f"{row}.0", f"{row}.0.1", f"{row}.0-1", f"{row}.0.1-1")
+    ]
 
 
 def test_a_bank_tells_opposite_values_apart(irl, tmp_path):
