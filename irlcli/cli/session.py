@@ -162,20 +162,24 @@ class StageSession(base.StageSession):
             self.print_artefact(artefact, name, details)
         return artefacts
 
-    def prepare(self, request: "Request") -> Artefact | None:
-        """The artefact of ``request``, not printed.
+    def prepare(self, request: "Request", output: str) -> tuple[Artefact, Path] | None:
+        """The artefact of ``request``, not printed, and its file ``output``.
 
         With ``--dry-run`` None if it is missing; the printed plan shows ``train-airl`` as blocked.
         """
         if not self.dry_run:
-            return super().prepare(request)
+            return super().prepare(request, output)
         self.prepared.append(request)
         from irlcli.experiments.status import Step
 
-        steps = self.runner().plan(request)
-        if steps[-1].artefact is None:
-            self.print_plan([*steps, Step("BLOCKED", "train-airl", f"waits for {request.label}")])
-        return steps[-1].artefact
+        lookup = self.runner().lookup()
+        step, path = lookup(request), lookup.file(request, output)
+        if step.artefact is None or path is None:
+            waiting = Step("BLOCKED", "train-airl", f"waits for {request.label}")
+            self.print_plan([*lookup.chain(request), waiting])
+            return None
+        here = step.status == "HIT"
+        return step.artefact, self.store.open(step.artefact, output) if here else path
 
     def print_plan(self, steps: Sequence["Step"]) -> None:
         """A line for each step: its status, its label, and why."""

@@ -207,13 +207,14 @@ class StageSession(Session):
                 self.store.set_name(name, artefacts[0])
         return artefacts
 
-    def prepare(self, request: "Request") -> Artefact | None:
-        """The artefact of ``request``, on which the request of ``train-airl`` depends.
+    def prepare(self, request: "Request", output: str) -> tuple[Artefact, Path] | None:
+        """The artefact of ``request`` and its file ``output``; ``train-airl`` depends on them.
 
         None if nothing may be run, and it is missing.
         """
         self.prepared.append(request)
-        return self.run([request])[0]
+        (made,) = self.run([request])
+        return made, self.store.open(made, output)
 
     def warn_of_unread(self, requests: Sequence["Request"]) -> None:
         """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold."""

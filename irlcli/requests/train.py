@@ -87,10 +87,10 @@ def train_airl(
 
 def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | None:
     """The lambda that ``request`` chooses, and the file that says so; None if nothing may be run."""
-    made = session.prepare(request)
-    if made is None:
+    prepared = session.prepare(request, "choice.json")
+    if prepared is None:
         return None
-    path = session.store.open(made, "choice.json")
+    made, path = prepared
     found = descriptions.convert(read_json(path), choice.Choice, path)
     tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
     tried = ",".join(f"{weight:g}" for weight in found.weights)

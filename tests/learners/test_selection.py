@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 
+import fsspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -179,6 +180,18 @@ def test_lambda_is_the_one_that_does_best_in_the_settings_left_out(chosen):
             row = made["scores"][made["weights"].index(weight)]
             assert [s["setting"] for s in summary["settings"]] == [setting]
             assert summary["settings"][0]["mean_return"] == row[setting]
+
+
+def test_a_choice_behind_a_url_is_planned_with(chosen, smoke_store, run_irl, tmp_path):
+    place = f"memory://{tmp_path.name}"
+    assert run_irl(["push", "chosen", "--to", place, "--store", str(chosen.root)]).code == 0
+    demos = str(smoke_store.path / smoke_store.demos)
+    arguments = ["train-airl", "--demos", demos, "--method", "irm", "--choose-penalty", "1,0.1"]
+    arguments += ["--profile", "smoke", "--store", str(tmp_path / "none"), "--from", place]
+    done = run_irl([*arguments, "--dry-run"])
+    fsspec.filesystem("memory").rm(f"/{tmp_path.name}", recursive=True)
+    assert done.code == 0, done.err
+    assert done.out.startswith("FOUND") and not (tmp_path / "none").exists()
 
 
 def test_the_selected_round_is_on_record(chosen, run_irl):
