@@ -16,7 +16,7 @@ from irlcli.cli.session import Session, StageSession
 from irlcli.requests.session import DEFAULT_PROFILE, DEFAULT_STORE
 
 Ref = Annotated[str, typer.Argument(help="Artefact: path, name, or id prefix of 3+ digits.")]
-# The largest seed that a table may list.
+# As irlcli.configs.fields.MAX_COUNT, whose package a light command does not load.
 MAX_SEED = 2**53
 Seed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Seed of everything random.")]
 Name = Annotated[str | None, typer.Option(help="Name to give the artefact.")]

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypedDict, TypeVar
 
+from irlcli.configs.fields import MAX_COUNT
 from irlcli.configs.load import field_of
 from irlcli.errors import IrlError, UsageError, file_failure, suggest
 
@@ -200,4 +201,6 @@ def whole(name: str, given: int, least: int = 0) -> int:
         ) from None
     if number < least:
         raise UsageError(f"{name} {number} is less than {least}", f"write {name}={least} or more")
+    if number > MAX_COUNT:
+        raise UsageError(f"{name} is more than {MAX_COUNT}", f"write {name}={MAX_COUNT} or less")
     return number

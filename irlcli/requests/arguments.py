@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 
-from irlcli.configs.fields import NonNegative
+from irlcli.configs.fields import MAX_COUNT, NonNegative
 from irlcli.configs.load import field_of
 from irlcli.envs.registry import environment, resolve
 from irlcli.errors import UsageError, suggest
@@ -232,7 +232,7 @@ def counts(text: str) -> tuple[int, ...]:
         UsageError: not a list of whole numbers.
     """
     try:
-        return tuple(int(part) for part in text.split(","))
+        return _whole_numbers(text)
     except ValueError:
         raise UsageError(
             f"--episodes {text!r} is not a list of counts", "write 10, or 1,3,10 for three settings"
@@ -243,17 +243,29 @@ def seeds(text: str) -> tuple[int, ...]:
     """``--seeds``: ``0,1,2,3,4``.
 
     Raises:
-        UsageError: not a list of whole numbers from 0 up.
+        UsageError: not a list of whole numbers from 0 to :data:`MAX_COUNT`.
     """
     try:
-        numbers = tuple(int(part) for part in text.split(","))
+        numbers = _whole_numbers(text)
     except ValueError:
         raise UsageError(
             f"--seeds {text!r} is not a list of seeds", f"write {_list_of(text)}"
         ) from None
-    if min(numbers) < 0:
-        raise UsageError(f"--seeds {text!r} holds a negative seed", "seeds are 0 or more")
+    if min(numbers) < 0 or max(numbers) > MAX_COUNT:
+        raise UsageError(f"--seeds {text!r} is out of range", f"seeds are from 0 to {MAX_COUNT}")
     return numbers
+
+
+def _whole_numbers(text: str) -> tuple[int, ...]:
+    """Whole numbers between commas.
+
+    Raises:
+        ValueError: anything else, also what int() takes besides digits: ``1_000``, ``+1``.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(re.fullmatch("0|-?[1-9][0-9]*", part) for part in parts):
+        raise ValueError(text)
+    return tuple(map(int, parts))
 
 
 def _list_of(text: str) -> str:

@@ -177,6 +177,11 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
         (lambda lab: irlcli.Lab("s", storee=1), UsageError, "Lab has no argument 'storee'"),
         (lambda lab: lab.artefact("airl", profile="smoke"), UsageError, "no argument 'profile'"),
         (lambda lab: lab.evaluate(idle=True, **{**IDLE, "seed": -1}), UsageError, "seed=0 or more"),
+        (
+            lambda lab: lab.train_airl("demos", seed=2**53 + 1),
+            UsageError,
+            "9007199254740992 or less",
+        ),
         (lambda lab: lab.evaluate("airl", seed="0"), UsageError, "seed '0' is not a whole number"),
         (lambda lab: lab.evaluate("airl", profile="large"), UsageError, "smoke"),
         (
