@@ -160,7 +160,12 @@ def _stack(env: str, layers: Layers) -> Config:
         knob: _with_sections(knob, intervention, layers)
         for knob, intervention in config.interventions.items()
     }
-    return msgspec.structs.replace(config, interventions=interventions, airl=_airl(layers))
+    return msgspec.structs.replace(
+        config,
+        interventions=interventions,
+        airl=_airl(layers),
+        transfer=msgspec.convert(_transfer(layers), TransferConfig),
+    )
 
 
 def _with_sections(knob: str, listed: InterventionConfig, layers: Layers) -> InterventionConfig:
@@ -168,9 +173,9 @@ def _with_sections(knob: str, listed: InterventionConfig, layers: Layers) -> Int
     whole: dict[str, Any] = {"episodes": _episodes(knob, layers)}
     if listed.expert is not None:
         whole["expert"] = msgspec.convert(_section("expert", layers, knob), ExpertConfig)
-    if listed.transfer is not None:
-        whole["transfer"] = msgspec.convert(_section("transfer", layers, knob), TransferConfig)
-    if listed.airl is not None or listed.transfer is not None:
+    if listed.transfer is not None or listed.expert is not None:
+        whole["transfer"] = msgspec.convert(_transfer(layers, knob), TransferConfig)
+    if listed.airl is not None or "transfer" in whole:
         whole["airl"] = _airl(layers, knob)
     return msgspec.structs.replace(listed, **whole)
 
@@ -187,10 +192,16 @@ def _episodes(knob: str, layers: Layers) -> tuple[int, ...]:
 
 def _airl(layers: Layers, knob: str | None = None) -> AIRLConfig:
     """Challengers learn as retrained policies do, unless ``[airl.challenger.ppo]`` differs."""
-    airl, transfer = (_section(name, layers, knob) for name in ("airl", "transfer"))
+    airl, transfer = _section("airl", layers, knob), _transfer(layers, knob)
     own = airl.get("challenger", {}).get("ppo", {})
     ppo = _merge(transfer.get("ppo", {}), own)
     return msgspec.convert(_merge(airl, {"challenger": {"ppo": ppo}}), AIRLConfig)
+
+
+def _transfer(layers: Layers, knob: str | None = None) -> dict[str, Any]:
+    """Retrained policies learn as experts do, unless ``[transfer.ppo]`` differs."""
+    ppo = _section("expert", layers, knob).get("ppo", {})
+    return _merge({"ppo": ppo}, _section("transfer", layers, knob))
 
 
 def _section(section: str, layers: Layers, knob: str | None) -> dict[str, Any]:

@@ -149,5 +149,5 @@ def run(job: Job) -> None:
     write_json(job.output / "choice.json", msgspec.to_builtins(choice))
 
 
-# Challengers learn with the PPO of retrained policies.
-STAGE = Stage("choose-penalty", 3, run, reads=("airl", "transfer.ppo", "evaluation"))
+# Challengers learn with the PPO of retrained policies, and these with that of the experts.
+STAGE = Stage("choose-penalty", 3, run, reads=("airl", "transfer.ppo", "expert.ppo", "evaluation"))

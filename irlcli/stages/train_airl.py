@@ -373,5 +373,5 @@ def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping
     return stop
 
 
-# Challengers learn with the PPO of retrained policies.
-STAGE = Stage("train-airl", 5, run, reads=("airl", "transfer.ppo"))
+# Challengers learn with the PPO of retrained policies, and these with that of the experts.
+STAGE = Stage("train-airl", 5, run, reads=("airl", "transfer.ppo", "expert.ppo"))

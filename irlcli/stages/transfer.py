@@ -184,4 +184,5 @@ def _student(path: Path, config: Any) -> tuple[Policy, Any]:
     return student, replace(config, **{name: getattr(about.network, name) for name in own})
 
 
-STAGE = Stage("transfer", 3, run, reads=("transfer",))
+# Policies are retrained with the PPO of the experts.
+STAGE = Stage("transfer", 3, run, reads=("transfer", "expert.ppo"))

@@ -499,6 +499,20 @@ def test_a_knob_has_rewards_of_its_own(toml):
     assert bounce == msgspec.structs.replace(power, batch_size=64)
 
 
+def test_retrained_policies_and_challengers_learn_as_experts_do_unless_the_config_differs():
+    config = load_config("ant", overrides=["expert.ppo.n_epochs=3"])
+    assert config.transfer.ppo.n_epochs == config.airl.challenger.ppo.n_epochs == 3
+    # A knob's own experts, here with gSDE.
+    legs = parse_settings("ant", "leg-length=2x")
+    assert config.transfer_of(legs[0]).ppo == config.expert_of(legs[0]).ppo
+    assert config.airl_of(legs).challenger.ppo == config.expert_of(legs[0]).ppo
+    assert config.expert_of(legs[0]).ppo.use_sde and not config.transfer.ppo.use_sde
+    config = load_config("ant", overrides=["expert.ppo.n_epochs=3", "transfer.ppo.n_epochs=5"])
+    for ppo in (config.transfer.ppo, config.transfer_of(legs[0]).ppo, config.airl.challenger.ppo):
+        assert ppo.n_epochs == 5
+    assert config.expert.ppo.n_epochs == 3
+
+
 @pytest.mark.parametrize("env", [n for n, spec in ENVIRONMENTS.items() if not spec.tabular])
 def test_retraining_is_as_strong_as_the_experts_training(env):
     """The same steps and the same PPO in every setting, on normalised rewards, but for what docs name.
