@@ -211,6 +211,28 @@ def test_a_transfer_evaluated_without_its_reward_counts_too(report, irl, table_s
     ]
 
 
+def test_the_learning_curve_of_a_retrained_policy_is_that_of_the_restart_kept(
+    report, irl, table_store, tmp_path, monkeypatch
+):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    restarts = [*SMALL, "--set", "transfer.restarts=2"]
+    common = ["--store", copy, "--profile", "smoke", "--quiet", *restarts]
+    moved = irl("transfer", "--reward", "erm.0", "--ood", "1.5x", *common, "--name", "best")
+    assert moved.code == 0, moved.err
+    assert irl("evaluate", "--policy", "best", "--reward", "erm.0", *common).code == 0
+    drawn = {}
+    monkeypatch.setattr(
+        "irlcli.report.plots.learning_curves", lambda p, found: drawn.update(found) or {}
+    )
+    done = report("table1", copy, *ROW, methods="erm", seeds="0", small=restarts)
+    assert done.code == 0, done.err
+    (curve,) = (curve for role, curve in drawn.items() if role.endswith("transfer-learning"))
+    metrics = pd.read_parquet(Path(moved.out.strip()) / "metrics.parquet")
+    assert set(metrics["restart"]) == {0, 1}
+    pd.testing.assert_frame_equal(curve, metrics[metrics["kept"]])
+
+
 def test_what_is_missing_is_said(report, table_store):
     done = report("table1", table_store, *ROW)
     said = caveats(done)
