@@ -69,7 +69,7 @@ def shown_commands(page: Path) -> list[str]:
 
 
 def check_command(text: str) -> None:
-    """Fails if the command line has no such command or option."""
+    """Fails if there is no such command or option, or results lack the names of their own they need."""
     group = typer.main.get_command(app)
     words = shlex.split(text.replace("[", "").replace("]", ""), comments=True)[1:]
     words = [word for word in words if word not in ("...", "\\")]
@@ -83,9 +83,10 @@ def check_command(text: str) -> None:
     own = command.make_context(words[0], [], resilient_parsing=True)
     parameters = command.get_params(own)
     known = {o for parameter in parameters for o in (*parameter.opts, *parameter.secondary_opts)}
-    for word in rest:
-        if word.startswith("--"):
-            assert word.partition("=")[0] in known, text
+    given = {word.partition("=")[0] for word in rest if word.startswith("--")}
+    assert given <= known, text
+    if words[0] in ("plan", "run") and given & {"--set", "--settings", "--choose-penalty"}:
+        assert "--tag" in given, text
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
@@ -95,9 +96,15 @@ def test_every_command_shown_has_its_options(page: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["irl train-aril --demos x", "irl transfer --rewards x", "irl --versio"]
+    "text",
+    [
+        "irl train-aril --demos x",
+        "irl transfer --rewards x",
+        "irl --versio",
+        "irl run figure2 --set maxent.inputs=coordinates",
+    ],
 )
-def test_a_command_that_does_not_exist_is_noticed(text: str) -> None:
+def test_a_command_that_fails_is_noticed(text: str) -> None:
     with pytest.raises(AssertionError):
         check_command(text)
 
