@@ -95,6 +95,12 @@ def test_every_command_shown_has_its_options(page: Path) -> None:
         check_command(text)
 
 
+def test_the_commands_of_published_results_have_their_options() -> None:
+    for page in sorted((CHECKOUT / "docs" / "results").rglob("README.md")):
+        for text in shown_commands(page):
+            check_command(text)
+
+
 @pytest.mark.parametrize(
     "text",
     [
