@@ -57,7 +57,7 @@ def test_the_readme_leads_to_every_page() -> None:
 def shown_lines(page: Path) -> list[str]:
     """Every line of the code blocks and every text between backticks, without comments."""
     lines = [line.removeprefix("$ ") for text in blocks(page) for line in text.splitlines()]
-    prose = BLOCK.sub("", page.read_text("utf-8")).replace("\n", " ")
+    prose = re.sub(r"\s*\n\s*", " ", BLOCK.sub("", page.read_text("utf-8")))
     lines += re.findall(r"`([^`]+)`", prose)
     # In a list of commands two spaces separate a command from its description.
     return [re.split(r"\s{2,}|\s\|\s", line)[0] for line in lines if re.match(r"(irl|make) ", line)]
