@@ -202,6 +202,10 @@ def recorded(texts: Sequence[str]) -> tuple[Form, list[Source]]:
         NotFound: a source does not exist.
         UsageError: sources of several forms, or of none.
     """
+    if not texts:
+        raise UsageError(
+            "no demonstrations to import", "name a file, a directory or minari:DATASET"
+        )
     found = [(_form(text), _recorded(text)) for text in texts]
     forms = sorted({form for form, _ in found})
     if len(forms) > 1:

@@ -188,17 +188,12 @@ def joined(given: Any) -> str | None:
 def number(name: str, given: float | None) -> float | None:
     try:
         return None if given is None else float(given)
-    except (TypeError, ValueError):
-        raise UsageError(f"{name} {given!r} is not a number", f"write {name}=1.0") from None
+    except OverflowError:
+        raise UsageError(f"{name} is too large for a number", f"write {name}=1.0") from None
 
 
 def whole(name: str, given: int, least: int = 0) -> int:
-    try:
-        number = operator.index(given)
-    except TypeError:
-        raise UsageError(
-            f"{name} {given!r} is not a whole number", f"write {name}={least}"
-        ) from None
+    number = operator.index(given)
     if number < least:
         raise UsageError(f"{name} {number} is less than {least}", f"write {name}={least} or more")
     if number > MAX_COUNT:

@@ -303,7 +303,7 @@ class Lab:
         ood: str | Sequence[str] | None = None,
         *,
         expert: bool = False,
-        trained_in: str | None = None,
+        trained_in: str | Sequence[str] | None = None,
         random: bool = False,
         idle: bool = False,
         reward: Ref | None = None,
@@ -332,7 +332,7 @@ class Lab:
         options: dict[str, Any] = {
             "policy": None if policy is None else self._ref(policy),
             "expert": expert,
-            "trained_in": trained_in,
+            "trained_in": joined(trained_in),
             "random": random,
             "idle": idle,
             "reward": None if reward is None else self._ref(reward),

@@ -109,7 +109,7 @@ def test_tables_are_data_frames(lab, irl, store_copy):
     assert len(score.to_pandas("episodes.parquet")) == score.to_pandas()["episodes_per_seed"][0]
     with pytest.raises(UsageError, match=r"reward\.pt"):
         airl.to_pandas("reward.pt")
-    experts = lab.evaluate(expert=True, trained_in="engine-power", **{**IDLE, "episodes": 1})
+    experts = lab.evaluate(expert=True, trained_in=["engine-power"], **{**IDLE, "episodes": 1})
     assert experts.to_pandas()["agent"].tolist() == [
         "expert of engine-power=1x",
         "expert of engine-power=1.25x",
@@ -173,6 +173,12 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
         (lambda lab: lab.train_airl("demos", "irm", 10), UsageError, "train_airl: too many"),
         (lambda lab: lab.collect_experts(), UsageError, "collect_experts: missing a required"),
         (lambda lab: lab.plan(None), UsageError, "table None is not text"),
+        (lambda lab: lab.import_demonstrations([], "ant", "mass=2x"), UsageError, "no demonstra"),
+        (
+            lambda lab: lab.train_airl("demos", "irm", penalty_weight=10**400),
+            UsageError,
+            "penalty_weight is too large",
+        ),
         (lambda lab: lab.evaluate("airl", settings=3), UsageError, "settings 3 is not text or a"),
         (lambda lab: irlcli.Lab("s", storee=1), UsageError, "Lab has no argument 'storee'"),
         (lambda lab: lab.artefact("airl", profile="smoke"), UsageError, "no argument 'profile'"),
