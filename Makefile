@@ -84,11 +84,12 @@ all-results: experts table1 figure2 figure3 figure4 table2
 
 table1 table1-5 figure3 figure4 gates retraining mujoco mujoco-gates control-airl control-airl-5: %: %.returns
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
-%.returns: %.transfers
+# Jobs of a cluster are submitted at once: each starts when its inputs exist, not when a phase ends.
+%.returns: $(if $(CLUSTER),$(READY),%.transfers)
 	$(IRL) run $* $(OPTIONS) --until returns
-%.transfers: %.rewards
+%.transfers: $(if $(CLUSTER),$(READY),%.rewards)
 	$(IRL) run $* $(OPTIONS) --until transfers
-%.rewards: %.experts
+%.rewards: $(if $(CLUSTER),$(READY),%.experts)
 	$(IRL) run $* $(OPTIONS) --until rewards
 %.experts: $(READY)
 	$(IRL) run $* $(OPTIONS) --until experts

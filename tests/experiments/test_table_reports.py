@@ -581,6 +581,7 @@ def test_make_passes_its_variables_on():
     ]
     assert all(" run table1 --store runs --profile standard " in line for line in plain)
     assert len(commands("figure4.rewards")) == 2
+    assert len(commands("table1", "CLUSTER=slurm")) == 2
     assert "--store elsewhere " in commands("demo", "IRL_STORE=elsewhere")[0]
     assert "--store here " in commands("demo", "IRL_STORE=elsewhere", "STORE=here")[0]
     assert "--from settings " in commands("demo", "FROM=settings")[0]
