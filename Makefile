@@ -2,7 +2,7 @@
 # make test       the tests              make lint   ruff and mypy
 # make table1     a table of the paper: missing experts, rewards, retrained policies and returns are
 #                 made, then the report. Also figure2 figure3 figure4 table2 experts gates
-#                 retraining control control-airl control-airl-5 table1-5 mujoco mujoco-gates
+#                 retraining retraining-ant control control-airl control-airl-5 table1-5 mujoco mujoco-gates
 #                 all-results.
 #                 `make table1.rewards` stops after a phase: experts, rewards, transfers or returns.
 # make report-table1      a report on what exists; runs nothing
@@ -47,7 +47,7 @@ OPTIONS  = $(CHOSEN) $(if $(filter slurm,$(CLUSTER)),,--jobs $(JOBS)) $(addprefi
     $(addprefix --partition ,$(PARTITION)) $(addprefix --time ,$(TIME)) $(addprefix --cpus ,$(CPUS))
 
 .PHONY: help demo test test-cluster lint bench bench-peers torture all-results experts table1 table2 figure2 figure3 figure4
-.PHONY: control control-airl control-airl-5 table1-5 gates retraining mujoco mujoco-gates clean
+.PHONY: control control-airl control-airl-5 table1-5 gates retraining retraining-ant mujoco mujoco-gates clean
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -82,7 +82,7 @@ demo: $(READY)
 
 all-results: experts table1 figure2 figure3 figure4 table2
 
-table1 table1-5 figure3 figure4 gates retraining mujoco mujoco-gates control-airl control-airl-5: %: %.returns
+table1 table1-5 figure3 figure4 gates retraining retraining-ant mujoco mujoco-gates control-airl control-airl-5: %: %.returns
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 # Jobs of a cluster are submitted at once: each starts when its inputs exist, not when a phase ends.
 %.returns: $(if $(CLUSTER),$(READY),%.transfers)

@@ -40,6 +40,7 @@ def test_the_shipped_tables_are_the_papers():
         "figure4",
         "gates",
         "retraining",
+        "retraining-ant",
         "control-airl",
         "control-airl-5",
         "table1-5",
