@@ -87,7 +87,7 @@ def plan(
         raise UsageError("--to prints no JSON", "omit --json or --to")
     choice = TableChoice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     plan = open_plan(session, choice)
-    check_tag(session, choice)
+    check_tag(session, choice, plan.table)
     if to is None:
         _print_plan(session, choice, plan)
         return
@@ -207,7 +207,7 @@ def run(
     about_jobs: Literal["status", "cancel"] | None = (
         "status" if status else "cancel" if cancel else None
     )
-    _check_options(session, choice, directory, options, about_jobs, detach)
+    _check_options(choice, directory, options, about_jobs, detach)
     options.check_used(detach)
     if session.dry_run and (status or cancel):
         raise UsageError(
@@ -215,6 +215,7 @@ def run(
         )
     runner = session.runner()
     plan = open_plan(session, choice)
+    check_tag(session, choice, plan.table)
     if directory is not None:
         check_out(directory, session.store.root, plan.table)
     if session.dry_run:
@@ -245,7 +246,6 @@ def run(
 
 
 def _check_options(
-    session: StageSession,
     choice: TableChoice,
     directory: Path | None,
     options: ClusterOptions,
@@ -259,7 +259,6 @@ def _check_options(
     Raises:
         UsageError: names them.
     """
-    check_tag(session, choice)
     if choice.only is not None and (choice.until or directory or options.jobs):
         raise UsageError("--only takes no --until, --out or --jobs", "omit them: it makes one step")
     if about_jobs and (directory or options.jobs):

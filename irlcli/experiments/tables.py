@@ -127,16 +127,19 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
     try:
         defaults = converted(tree.pop(_DEFAULTS, {}), _Defaults, _DEFAULTS, _EXAMPLES)
         tables = {name: _table(name, value, defaults, path.parent) for name, value in tree.items()}
-        _check_names(tables.values())
+        check_names(tables.values())
         return tables
     except (UsageError, NotFound) as error:
         raise type(error)(f"{path}: {error.message}", error.hint) from None
 
 
-def _check_names(tables: Iterable[Table]) -> None:
+def check_names(tables: Iterable[Table]) -> None:
     """Refuse two tables whose steps have one name and another config.
 
     Tables without settings of their own share the names of equal rows and methods.
+
+    Raises:
+        UsageError: names both tables.
     """
     first: dict[tuple[Row, str], tuple[str, Any]] = {}
     for table in tables:

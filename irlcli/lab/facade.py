@@ -428,7 +428,7 @@ class Lab:
         )
         with self._at_work(configs, [], read_only=True) as session:
             plan = planning.open_plan(session, chosen)
-            planning.check_tag(session, chosen)
+            planning.check_tag(session, chosen, plan.table)
             return PlannedTable(table, planning.steps_of(plan))
 
     def _session(

@@ -70,17 +70,25 @@ def needs_tag(session: StageSession, choice: TableChoice) -> bool:
     return choice.tag is None and bool(other)
 
 
-def check_tag(session: StageSession, choice: TableChoice) -> None:
+def check_tag(session: StageSession, choice: TableChoice, table: "Table") -> None:
     """Refuse names that are those of other results.
 
     Raises:
-        UsageError: a tag is missing, see :func:`needs_tag`.
+        UsageError: a tag is missing, see :func:`needs_tag`; or ``table``, of another file, has steps
+            whose names are those of a shipped table with another lambda or other overrides.
     """
+    from irlcli.experiments.tables import check_names, load_tables
+
     if needs_tag(session, choice):
         raise UsageError(
             "results with --settings, --set or --choose-penalty need names of their own",
             "add --tag NAME",
         )
+    if choice.file is not None and choice.tag is None:
+        try:
+            check_names([*load_tables().values(), table])
+        except UsageError as error:
+            raise UsageError(error.message, f"add --tag NAME, or {error.hint}") from None
 
 
 def open_plan(session: StageSession, choice: TableChoice) -> "Plan":

@@ -38,7 +38,8 @@ def tables(tmp_path_factory):
 def made(tables, smoke_store, run_irl):
     store = tables.parent / "runs"
     line = ["control", "--experiments", str(tables), "--profile", "smoke", "--store", str(store)]
-    line += ["--from", str(smoke_store.path)]
+    # The shipped control has another lambda in this row.
+    line += ["--from", str(smoke_store.path), "--tag", "smoke"]
     # Without --only, each step would be a process.
     for step in json.loads(run_irl(["plan", *line, "--json"]).out)["steps"]:
         done = run_irl(["run", *line, "--quiet", "--only", step["name"]])
@@ -115,8 +116,8 @@ def test_a_bank_has_one_expert_in_each_setting(made):
 def test_a_bank_of_a_table_has_one_expert_in_each_setting(irl, tmp_path):
     path = tmp_path / "tables.toml"
     path.write_text(TABLES.replace('"cue"]', '"cue", "assess"]'))
-    line = ["plan", "control", "--experiments", path, "--profile", "smoke", "--json"]
-    planned = irl(*line, "--store", tmp_path / "runs")
+    line = ["plan", "control", "--experiments", path, "--profile", "smoke", "--tag", "smoke"]
+    planned = irl(*line, "--store", tmp_path / "runs", "--json")
     names = [step["name"] for step in json.loads(planned.out)["steps"]]
     experts = [name for name in names if "bank.expert" in name]
     assert experts == [f"{ROW}.bank.expert-of-{v}.{v}" for v in ("0.95", "0.8", "0.1")]
@@ -124,6 +125,7 @@ def test_a_bank_of_a_table_has_one_expert_in_each_setting(irl, tmp_path):
 
 def test_a_second_run_finds_everything(made, tables, irl):
     line = ["plan", "control", "--experiments", tables, "--profile", "smoke", "--store", made]
+    line += ["--tag", "smoke"]
     steps = json.loads(irl(*line, "--json").out)["steps"]
     assert {s["status"] for s in steps} == {"HIT"}
 

@@ -229,4 +229,10 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     own = tmp_path / "mine.toml"
     own.write_text(SOUND.replace("leg-length", "leg-lenght"))
     assert f"{own}: mine.rows" in refused("plan", "mine", "--experiments", own)
+    own.write_text(f"{SOUND}penalty_weights = {{irm = 3}}\n")
+    for command in ("plan", "run"):
+        assert "add --tag NAME" in refused(command, "mine", "--experiments", own)
+    sound = ["plan", "mine", "--experiments", own, "--store", tmp_path / "runs"]
+    for more in (["--tag", "x"], ["--methods", "erm"]):
+        assert irl(*sound, *more).code == 0
     assert "cannot be read" in refused("plan", "mine", "--experiments", tmp_path / "none.toml")
