@@ -62,7 +62,7 @@ class TerminalConsole:
         self._tensorboard = tensorboard
         self._writer: Any = None
         if tensorboard is not None:
-            _require_tensorboard(tensorboard)
+            _require_tensorboard()
         self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
 
     @property
@@ -311,14 +311,10 @@ def _shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
-def _require_tensorboard(directory: Path) -> None:
-    """Fail before the work, not after its first round, if TensorBoard cannot be written."""
+def _require_tensorboard() -> None:
+    """Fail before the work, not after its first round, if TensorBoard is missing."""
     import importlib.util
 
-    if directory.exists() and not directory.is_dir():
-        raise UsageError(
-            f"--tensorboard {directory} is not a directory", "name a directory, or a new one"
-        )
     if importlib.util.find_spec("tensorboard") is None:
         raise UsageError(
             "--tensorboard needs the package tensorboard, which is not installed",

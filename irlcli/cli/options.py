@@ -45,6 +45,23 @@ def directory(text: str) -> Path:
     return Path(text)
 
 
+def writable_directory(text: str) -> Path:
+    """The directory that an option names to write to, checked before any work is done.
+
+    Raises:
+        BadParameter: it cannot be written or created.
+    """
+    # Not Path.resolve, which raises where links form a circle.
+    there = directory(text).absolute()
+    while not os.path.lexists(there):
+        there = there.parent
+    if not there.is_dir():
+        raise typer.BadParameter(f"{there} is not a directory")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise typer.BadParameter(f"{there} is not writable")
+    return Path(text)
+
+
 _Store = Annotated[
     Path,
     typer.Option(envvar="IRL_STORE", help="Artefact store.", parser=directory, metavar="PATH"),
@@ -54,7 +71,7 @@ Out = Annotated[
     typer.Option(
         "--out",
         help="Directory to copy the report's files to.",
-        parser=directory,
+        parser=writable_directory,
         metavar="PATH",
     ),
 ]
@@ -102,7 +119,7 @@ def _stage_session(
         Path | None,
         typer.Option(
             help="Also write the metrics to this TensorBoard directory.",
-            parser=directory,
+            parser=writable_directory,
             metavar="PATH",
         ),
     ] = None,

@@ -56,11 +56,9 @@ def check_out(directory: Path, store: Path, table: "Table") -> None:
     """Refuse a directory for the files of a report on ``table`` before any work is done.
 
     Raises:
-        UsageError: it is a file, lies in the store, or has a README.md of something else.
+        UsageError: it lies in the store, or has a README.md of something else.
     """
-    if directory.exists() and not directory.is_dir():
-        raise UsageError(f"--out {directory} is not a directory", "name a directory")
-    if directory.resolve().is_relative_to(store.resolve()):
+    if Path(os.path.realpath(directory)).is_relative_to(os.path.realpath(store)):
         raise UsageError(f"--out {directory} lies in the store", "name another directory")
     numbers = directory / f"{table.name if table.kind == 'comparison' else table.kind}.csv"
     if (directory / "README.md").exists() and not numbers.exists():

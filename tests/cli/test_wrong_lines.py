@@ -149,6 +149,7 @@ WRONG = [
     ("train-airl --demos demos --settings {tmp}/unknown.toml", 2, "unknown.toml"),
     ("train-airl --demos demos --settings {tmp}/hostile.toml", 2, "hostile.toml"),
     (f"collect-experts {LANDER} --tensorboard {{tmp}}/broken.toml", 2, "is not a directory"),
+    (f"collect-experts {LANDER} --tensorboard {{tmp}}/broken.toml/x", 2, "is not a directory"),
     # Agents
     ("evaluate", 2, "no agents"),
     ("evaluate --random --idle", 2, "2 agents"),

@@ -217,7 +217,10 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     assert "the list is empty" in refused("plan", "table1", "--methods", "")
     assert "unknown --until ''" in refused("plan", "table1", "--until", "")
     (tmp_path / "file").touch()
-    assert "is not a directory" in refused("run", "demo", "--out", tmp_path / "file")
+    (tmp_path / "loop").symlink_to("loop")
+    for place in ("file", "file/sub", "loop", "loop/sub"):
+        for command in ("report", "run"):
+            assert "is not a directory" in refused(command, "demo", "--out", tmp_path / place)
     assert "lies in the store" in refused("run", "demo", "--out", tmp_path / "runs" / "out")
     (tmp_path / "README.md").touch()
     for command in ("report", "run"):
