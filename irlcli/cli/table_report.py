@@ -28,7 +28,7 @@ def report_of(session: StageSession, choice: TableChoice, plan: "Plan") -> "Requ
     from irlcli.experiments import report
 
     # A figure's request is made from the steps themselves, so running it would compute them.
-    if plan.figure is not None and not session.dry_run:
+    if plan.figure is not None:
         missing = sum(not plan.exists(name) for name in plan.tasks)
         if missing:
             raise NotFound(

@@ -30,6 +30,7 @@ WRONG = [
     ("report returns", 2, "name at least one evaluation"),
     ("report table9 score", 2, "table9"),
     ("report figure2 --profile smoke", 3, "figure2"),
+    ("report control --profile smoke --dry-run", 3, "control"),
     ("report returns score --out x", 2, "--out"),
     ("report returns score --set airl.penalty_weight=3", 2, "--set"),
     ("report returns score --dry-run", 2, "--dry-run"),
