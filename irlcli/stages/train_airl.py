@@ -194,7 +194,7 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, airl = p.environment.name, p.airl
     settings = _trained(airl, p.settings)
-    _warn_of_ramp(job)
+    _warn_of_rounds(job)
     episodes, held_out = _episodes(job, settings)
     parsed = [parse_setting(env, text) for text in settings]
     with ExitStack() as stack:
@@ -235,8 +235,8 @@ def run(job: Job) -> None:
     write_metrics(job.output, rows)
 
 
-def _warn_of_ramp(job: Job) -> None:
-    """Warn if training ends before lambda has its full value."""
+def _warn_of_rounds(job: Job) -> None:
+    """Warn if training ends before lambda has its full value, or within a challenger's life."""
     from irlcli.learners.discriminator import penalty_weight_at
 
     airl: AIRLConfig = job.parameters.airl
@@ -247,6 +247,12 @@ def _warn_of_ramp(job: Job) -> None:
         job.console.warn(
             f"lambda reaches {last:g} of {airl.penalty_weight:g}: warm-up and ramp take "
             f"{warmup + ramp} rounds, training has {rounds}"
+        )
+    life = airl.challenger.life
+    if life and rounds % life:
+        job.console.warn(
+            f"the last challenger has {rounds % life} of {life} rounds (airl.challenger.life): "
+            f"training has {rounds}"
         )
 
 

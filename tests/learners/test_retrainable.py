@@ -253,6 +253,7 @@ def test_challengers_per_setting_share_the_worlds_in_the_order_of_the_settings(
     assert done.code == 0, done.err
     one, two = (str(setting) for setting in SETTINGS)
     assert made == [([one, two], 4), ([one], 2), ([two], 2)]
+    assert "last challenger" not in done.err
 
 
 def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
@@ -476,12 +477,14 @@ def test_a_mean_of_more_rounds_than_there_are_is_refused_before_anything_runs(ir
     assert "airl.averaged_rounds = 1000, but training has" in done.err
 
 
-def test_a_penalty_that_never_begins_is_refused_and_one_that_stays_small_is_named(irl, store_copy):
+def test_a_penalty_that_never_begins_is_refused_and_what_ends_too_early_is_named(irl, store_copy):
     line = ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", store_copy.path]
     irm = [*line, "--method", "irm", "--penalty-weight", "10"]
     late = ["--set", "airl.penalty_warmup_rounds=1000"]
     refused = irl(*irm, *late, "--dry-run")
     assert refused.code == 2 and "airl.penalty_warmup_rounds = 1000 leaves no round" in refused.err
     assert irl(*line, "--method", "erm", *late, "--dry-run").code == 0
+    irm += ["--set", "airl.logit=f", "--set", "airl.challenger.life=1000"]
     slow = irl(*irm, "--set", "airl.penalty_ramp_rounds=1000")
     assert slow.code == 0 and "lambda reaches 0.0" in slow.err and "of 10:" in slow.err
+    assert "the last challenger has" in slow.err and "of 1000 rounds" in slow.err
