@@ -62,6 +62,10 @@ def _by_section(request: Request) -> Any:
     match request.stage.name:
         case "train-expert":
             return SimpleNamespace(expert=request.parameters)
+        case "train-airl":
+            # Challengers learn with the PPO of retrained policies.
+            airl = request.parameters.airl
+            return SimpleNamespace(airl=airl, transfer=SimpleNamespace(ppo=airl.challenger.ppo))
         case "sweep-maxent":
             # What the sweep varies is at its default here.
             return SimpleNamespace(maxent=request.parameters.shared)

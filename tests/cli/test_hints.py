@@ -285,13 +285,21 @@ def test_a_field_that_no_step_of_a_table_reads_is_named(irl, tmp_path, table, it
 ERM = "train-airl --demos demos --method erm"
 # Challengers in each setting, averaged by the rates of a schedule that falls.
 PARTS = ("airl.challenger.per_setting=true", "airl.averaged_by=learning-rate")
+CHALLENGED = ("airl.challenger.life=1", "airl.logit=f", "airl.policy_reward=f")
 
 
 @pytest.mark.parametrize(
     ("line", "items", "unused"),
     [
         (ERM, [PARTS[0], "airl.challenger.life=0"], {PARTS[0]: "false"}),
-        (ERM, [PARTS[0], "airl.challenger.life=1", "airl.logit=f", "airl.policy_reward=f"], {}),
+        (ERM, [PARTS[0], *CHALLENGED], {}),
+        (ERM, ["transfer.ppo.gamma=0.9"], {"transfer.ppo.gamma=0.9": "0.999"}),
+        (ERM, ["transfer.ppo.gamma=0.9", *CHALLENGED], {}),
+        (
+            ERM,
+            ["transfer.ppo.gamma=0.9", "airl.challenger.ppo.gamma=0.5", *CHALLENGED],
+            {"transfer.ppo.gamma=0.9": "0.5"},
+        ),
         (ERM, [PARTS[1], "airl.averaged_rounds=1"], {PARTS[1]: "rounds"}),
         (ERM, ["airl.pairing=pooled"], {"airl.pairing=pooled": "matched"}),
         (f"{ERM}-balanced", ["airl.pairing=pooled"], {}),
