@@ -108,7 +108,7 @@ def test_every_penalty_has_as_many_candidates_of_its_own():
     assert counts == {3}
 
 
-@pytest.mark.parametrize("name", COMPARING)
+@pytest.mark.parametrize("name", [*COMPARING, "irm-shuffled"])
 def test_two_settings_are_too_few_to_leave_one_out_and_compare_the_others(name):
     settings = config(name)
     arguments = (DEMOS, LANDER, SETTINGS[:2], settings.airl, settings.evaluation, [1.0, 10.0])

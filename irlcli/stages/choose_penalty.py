@@ -63,7 +63,7 @@ def request(
 
     Raises:
         UsageError: fewer than two settings or weights (or than three settings, for a penalty that
-            compares them), a method without penalty, or a round that is selected by one of the
+            compares them and for shuffled ones), a method without penalty, or a round that is selected by one of the
             settings.
     """
     texts = tuple(str(s) for s in settings)
@@ -105,10 +105,10 @@ def _candidates(
             "--choose-penalty needs at least two candidates",
             "for example --choose-penalty 0.1,1,10",
         )
-    if penalty.compares and len(settings) < 3:
+    if (penalty.compares or airl.grouping == "shuffled") and len(settings) < 3:
         raise UsageError(
-            f"--choose-penalty leaves a setting out, and penalty {airl.penalty!r} compares at least "
-            f"two of the others: {len(settings)} settings are too few",
+            f"--choose-penalty leaves a setting out, and {train_airl.name(airl)} needs at least two "
+            f"of the others: {len(settings)} settings are too few",
             "choose lambda yourself, or collect demonstrations of a third setting",
         )
     if airl.select in settings:
