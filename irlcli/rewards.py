@@ -59,7 +59,8 @@ class LearnedReward:
                 terminate: pass False for it.
 
         Raises:
-            ValueError: arrays of other shapes, or indices of no action.
+            ValueError: arrays of other shapes, indices of no action, or a ``done`` that is neither
+                true nor false.
         """
         from irlcli.trajectories import ActionSpace, Transitions
 
@@ -84,9 +85,13 @@ class LearnedReward:
         for name, (array, shape) in wanted.items():
             if array.shape != shape:
                 raise ValueError(f"{name} is {list(array.shape)}, not {list(shape)}")
-        if self.discrete and space.outside(data.actions).any():
-            last = ", ".join(map(str, np.ravel(space.last)))
-            raise ValueError(f"act has indices below 0 or above {last}")
+        if self.discrete:
+            truncated = np.asarray(act) != data.actions
+            if (truncated | space.outside(data.actions)).any():
+                last = ", ".join(map(str, np.ravel(space.last)))
+                raise ValueError(f"act must hold indices from 0 to {last}")
+        if not np.isin(done, (0, 1)).all():
+            raise ValueError("done must hold true or false")
         return self._frozen.of_steps(data)
 
     def module(self) -> StandaloneReward:

@@ -146,6 +146,8 @@ def test_what_it_cannot_use_is_named(smoke_store, tmp_path):
         ((obs, act[:, 0], following, done), r"act is \[5\], not \[5, 6\]"),
         ((obs, act, following[:4], done), r"next_obs is \[4, 17\], not \[5, 17\]"),
         ((obs, act, following, False), r"done is \[\], not \[5\]"),
+        ((obs, act, following, [0.5] * 5), "done must hold"),
+        ((obs, act, following, ["False"] * 5), "done must hold"),
     ):
         with pytest.raises(ValueError, match=message):
             reward(*arguments)
@@ -277,8 +279,8 @@ def test_discrete_actions_work_too(tmp_path):
     ):
         DQN("MlpPolicy", env, learning_starts=10, policy_kwargs={"net_arch": [8]}).learn(30)
     still = np.zeros((1, 8), dtype=np.float32)
-    for index in (-1, 4):
-        with pytest.raises(ValueError, match="act has indices below 0 or above 3"):
+    for index in (-1, 4, -0.9, 3.5):
+        with pytest.raises(ValueError, match="act must hold indices from 0 to 3"):
             reward(still, [index], still, [False])
 
 
