@@ -20,9 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from irlcli.errors import StageFailed
 from irlcli.learners.grouping import Group, group
 from irlcli.learners.occupancy import Demonstrations, mean_occupancy
 from irlcli.learners.soft_values import Solution, solve
+from irlcli.networks import all_finite
 from irlcli.penalties import Occupancies, loss_divisor, occupancy_penalty
 from irlcli.seeds import derive
 from irlcli.tabular import StackedMDPs
@@ -235,6 +237,7 @@ class MaxEnt:
 
         Raises:
             ValueError: as :func:`irlcli.learners.soft_values.solve`.
+            StageFailed: the parameters or the square of their gradient stopped being finite.
         """
         risks = self._risks
         reward = self.networks(self._features)
@@ -257,9 +260,10 @@ class MaxEnt:
         elif self._penalty_warmup:
             divisor = self._divisor
         negative = -(risks.shares * each).sum(-1)
-        penalty, penalty_gradient = self._penalty(
-            Occupancies(phi, gap, risks.weights, negative, response, weight)
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+            penalty, penalty_gradient = self._penalty(
+                Occupancies(phi, gap, risks.weights, negative, response, weight)
+            )
         if record:
             total = (risks.weights * penalty).sum(-1)
             distance = np.abs(self._expert - visits).sum(-1)
@@ -275,8 +279,18 @@ class MaxEnt:
             parameter.grad += (
                 self._l2 / torch.as_tensor(divisor)[:, None, None] * parameter.detach()
             )
+            # RMSProp divides by a mean of squares: an infinite one would make every step zero.
+            self._require(bool(parameter.grad.square().isfinite().all()))
         self._optimizer.step()
+        self._require(all_finite(self.networks))
         self.iterations += 1
+
+    def _require(self, finite: bool) -> None:
+        if not finite:
+            raise StageFailed(
+                f"the reward's parameters or their gradient are not finite in iteration {self.iterations}",
+                "a smaller learning rate, lambda or l2 usually helps",
+            )
 
     def _solve(self, phi: np.ndarray, reuse: Solution | None) -> Solution:
         """The policies of ``phi`` [R, T] in every setting."""
@@ -309,7 +323,7 @@ class MaxEnt:
         after each of these. Returns the rewards [R, T].
 
         Raises:
-            ValueError: as :meth:`step`.
+            ValueError, StageFailed: as :meth:`step`.
         """
         while self.iterations < iterations:
             record = self.iterations % record_every == 0 or self.iterations == iterations - 1

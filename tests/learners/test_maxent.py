@@ -8,6 +8,7 @@ import torch
 from tabular_demos import expert_demonstrations, mazes
 
 from irlcli.envs.gridworld.env import gridworld, observations
+from irlcli.errors import StageFailed
 from irlcli.learners.maxent import MaxEnt, RewardNetworks, Risks, group_risks
 from irlcli.learners.occupancy import mean_occupancy
 from irlcli.learners.soft_values import solve
@@ -385,6 +386,15 @@ def test_networks_start_from_their_seed_only():
     reward = three(torch.as_tensor(observations(4)).double())
     assert torch.equal(reward[0], reward[2]) and not torch.equal(reward[0], reward[1])
     assert torch.allclose(one(torch.as_tensor(observations(4)).double())[0], reward[1])
+
+
+def test_a_fit_that_diverges_is_no_reward():
+    """Its next step would be to infinity, or, by RMSProp's infinite mean of squares, zero."""
+    settings, risks = stack([gridworld(3), gridworld(3)]), own_risks(np.ones((2, 9)))
+    for weight, rate in ((1.0, 1e300), (0.0, 1e308), (1e300, 1e-3)):
+        learner = maxent(settings, np.eye(9), risks, weight, learning_rate=rate)
+        with pytest.raises(StageFailed, match="not finite in iteration"):
+            learner.fit(5)
 
 
 # Bad arguments
