@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from irlcli import labels
 from irlcli.configs import AIRLConfig
-from irlcli.configs.relevance import relevant_airl
+from irlcli.configs.relevance import relevant_airl, relevant_ppo
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
@@ -69,8 +69,9 @@ def request(
 
     Raises:
         UsageError: a tabular environment, gSDE, worlds that the settings cannot share equally,
-            minibatches too small for shuffled settings, a selection by something that the
-            demonstrations do not hold, or a penalty that compares settings where there is one.
+            minibatches too small for shuffled settings, rollouts of a single sample, a selection by
+            something that the demonstrations do not hold, or a penalty that compares settings where
+            there is one.
     """
     check_tabular(env, "train-airl", wanted=False)
     if airl.ppo.use_sde:
@@ -94,6 +95,10 @@ def request(
     _check_rounds(relevant)
     if trained == 1:
         relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))
+    if relevant.challenger.per_setting is True:
+        # Each challenger has a share of the worlds.
+        share = replace(relevant.challenger.ppo, n_envs=airl.ppo.n_envs // trained)
+        relevant_ppo(share, spec.discrete_actions, "airl.challenger.ppo")
     if airl.grouping == "shuffled" and airl.batch_size < 2 * trained:
         raise UsageError(
             f"airl.batch_size = {airl.batch_size} cannot hold an even number of samples of each of "

@@ -254,6 +254,10 @@ def test_challengers_per_setting_share_the_worlds_in_the_order_of_the_settings(
     one, two = (str(setting) for setting in SETTINGS)
     assert made == [([one, two], 4), ([one], 2), ([two], 2)]
     assert "last challenger" not in done.err
+    single = [*line, "--dry-run", "--set", "airl.challenger.ppo.n_steps=1"]
+    assert irl(*single).code == 0
+    refused = irl(*single, "--set", "airl.ppo.n_envs=2")
+    assert refused.code == 2 and "airl.challenger.ppo: one world and one step" in refused.err
 
 
 def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
