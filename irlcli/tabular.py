@@ -269,6 +269,9 @@ def optimal_policy(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Value iteration over ``horizon`` steps: policy [H, A, E, S, R], uniform over ties, and V_0.
 
+    It plans for the H + 1 rewards that a demonstration has. ``Evaluation.true_return`` leaves out the
+    last one, so near a tight horizon another policy may have a slightly higher true return.
+
     Raises:
         ValueError: as :func:`backward`; or the goal of a setting cannot be reached, at all or
             within the horizon.

@@ -20,6 +20,9 @@ class Quality:
     concerns the reward's maximum-entropy policy: sum log pi of the choices made. Demonstrations end at the
     goal, so it does not count the choices in the absorbing state.
     :class:`irlcli.learners.maxent.Record` has another likelihood.
+
+    ``value_difference`` may be slightly negative near a tight horizon, see
+    :func:`irlcli.tabular.optimal_policy`.
     """
 
     goal_probability: np.ndarray  # of reaching the goal within the horizon
