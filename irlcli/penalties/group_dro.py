@@ -7,7 +7,7 @@ the shares of the settings computed anew from every batch instead of accumulated
 
 The minimised sum q_e R_e has the gradient of log(mean exp(lambda R)) / lambda, a soft maximum.
 Lambda is the step size of the shares: at 0 all settings weigh the same, at infinity the worst has
-all the weight. To first order in lambda this is V-REx.
+all the weight. To first order in lambda the loss's gradient is that of V-REx at lambda / 2.
 """
 
 from __future__ import annotations
