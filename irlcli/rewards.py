@@ -148,9 +148,12 @@ def load_reward(
     from irlcli.stages.base import environment_key, frozen_reward
 
     if gamma is not None and not 0.0 <= gamma < 1.0:
-        raise UsageError(f"gamma = {gamma:g} is no discount", "give a number from 0 to less than 1")
+        raise UsageError(
+            f"gamma = {gamma:g} is not a discount factor",
+            "give a number from 0 up to, but not including, 1",
+        )
     if ceiling is not None and not 0.0 <= ceiling <= 1.0:
-        raise UsageError(f"ceiling = {ceiling:g} is no quantile", "give a number from 0 to 1")
+        raise UsageError(f"ceiling = {ceiling:g} is not a quantile", "give a number from 0 to 1")
     if env is not None:
         resolve(env)
     opened = Store(Path(store))

@@ -266,7 +266,7 @@ def relevant_transfer(
             raise UsageError("SAC needs continuous actions", "use --algorithm ppo")
         if from_student:
             raise UsageError(
-                "--start student needs PPO: a student's network is no actor of SAC",
+                "--start student needs PPO: SAC cannot load a student's network",
                 "use --algorithm ppo",
             )
         sac = transfer.sac

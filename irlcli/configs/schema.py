@@ -154,7 +154,8 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     Attributes:
         algorithm: a key of :data:`irlcli.rl.ALGORITHMS`.
         ceiling: every step's reward is at most this quantile of g on the demonstrations; None: g
-            has no bound.
+            has no bound. A step that ends the episode also earns the series of its absorbing state
+            (``airl.fixed_horizon``), each term bounded.
         from_student: replaces the budget and the learning rate with ``--start student``.
         restarts: policies trained one after the other, each from other random weights. The one with
             the highest learned return is kept. ``--start student`` ignores it.
@@ -193,11 +194,12 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     negatives, so the reward corrects the states that a new policy goes through.
 
     Attributes:
-        life: rounds after which the next challenger starts from random weights; 0 for none.
+        life: rounds after which the next challenger starts from random weights; 0 for none. The last
+            one is cut short unless ``life`` divides the number of rounds.
         share: weight of the cross-entropy between challengers and experts in the loss.
         ceiling: quantile of g on the demonstrations that bounds a challenger's reward.
-        replay_episodes_per_round, replay_capacity: episodes a setting that each round adds, and
-            that are kept, every round's with the same probability.
+        replay_episodes_per_round, replay_capacity: episodes of each setting that a round adds, and the
+            most that are kept; all past rounds are equally likely.
         mixed_share: of the challengers' samples, those whose numbers are mixed with an expert's;
             see :mod:`irlcli.learners.mixing`.
         per_setting: each setting has a challenger of its own, as a retrained policy acts in one

@@ -29,7 +29,8 @@ class FrozenReward:
         observation_size: D of that setting.
         actions: its actions.
         ceiling: a step's reward is at most this quantile of g on the demonstrations; None: g has
-            no bound, as it was learned.
+            no bound, as it was learned. A step that ends the episode also earns the series of its
+            absorbing state, each term bounded.
 
     Raises:
         UsageError: the reward takes other observations or actions.

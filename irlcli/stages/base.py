@@ -284,8 +284,8 @@ def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
 
     if not hides_settings(counts):
         job.console.warn(
-            f"shuffled labels still tell the settings apart, so this is no control: a setting has "
-            f"{min(counts)} demonstrations, which {len(counts)} groups cannot share"
+            "shuffled labels still reveal the settings, so this is not a valid control: one setting "
+            f"has too few demonstrations ({min(counts)}) for {len(counts)} groups"
         )
 
 

@@ -61,7 +61,7 @@ def request(problem: str, labels: CuedLabelsConfig) -> Request:
         raise UsageError(
             f"control.labels.warmup = {labels.warmup} leaves none of {labels.steps} steps with a "
             "penalty",
-            "control.labels.warmup below control.labels.steps",
+            "set control.labels.warmup below control.labels.steps",
         )
     own = ("unit_steps", "unit_samples")
     others = ("steps", "warmup", "samples", "strengths", "unseen", "noise", "hidden")

@@ -59,7 +59,7 @@ def parts(maps: CuedMapsConfig) -> dict[str, Request]:
         raise UsageError(
             f"control.maps.warmup = {maps.warmup} leaves none of {maps.iterations} iterations with "
             "a penalty",
-            "control.maps.warmup below control.maps.iterations",
+            "set control.maps.warmup below control.maps.iterations",
         )
     found: dict[str, list[Case]] = {}
     for case in cases(maps):
@@ -95,7 +95,7 @@ def _check(maps: CuedMapsConfig) -> None:
             raise UsageError(
                 f"control.maps.{field} asks for {max(0, min(counts))} setting to train on, and "
                 "penalties that compare settings need two",
-                "at least two settings, and three where one is left out",
+                "give at least two settings, and three in each of control.maps.choices",
             )
 
 

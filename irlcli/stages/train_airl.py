@@ -303,8 +303,8 @@ def _learner(
     beyond = [column for column in airl.columns or () if not -size <= column < size]
     if beyond:
         raise UsageError(
-            f"airl.columns: {beyond[0]} is no entry of the {size} of an observation in {env} "
-            f"{settings[0]}",
+            f"airl.columns: observations in {env} {settings[0]} have {size} entries, so there is no "
+            f"entry {beyond[0]}",
             f"name some of {-size} to {size - 1}",
         )
     actions, horizon = action_space(worlds.action_space), p.environment.max_episode_steps

@@ -156,4 +156,4 @@ def test_fewer_than_two_settings_are_refused_by_every_part():
 
     with pytest.raises(UsageError, match="need two") as refused:
         control.request(replace(SMOKE, maps=replace(SMOKE.maps, strengths=(0.9,))))
-    assert "three where one is left out" in refused.value.hint
+    assert "control.maps.choices" in refused.value.hint
