@@ -90,12 +90,14 @@ def test_values_that_span_too_much_for_one_scale_are_solved_too(goal):
     solution = solve(settings, reward, 20)
     span = np.ptp(solution.log_weight, axis=1)
     assert (span > SAFE_SPAN).any() and (span < SAFE_SPAN).any()  # either way in one solution
-    for r in range(2):
-        leaf = torch.tensor(reward[r], requires_grad=True)
-        partition = dense_log_partition(settings.mdps[1], leaf, 20)
-        partition.backward()
-        assert solution.log_partition[r, 1] == pytest.approx(partition.item(), rel=1e-13)
-        assert np.allclose(solution.occupancy[r, 1], leaf.grad.numpy(), atol=1e-9)
+    assert np.isfinite(solution.policy).all()
+    for e, mdp in enumerate(settings.mdps):
+        for r in range(2):
+            leaf = torch.tensor(reward[r], requires_grad=True)
+            partition = dense_log_partition(mdp, leaf, 20)
+            partition.backward()
+            assert solution.log_partition[r, e] == pytest.approx(partition.item(), rel=1e-13)
+            assert np.allclose(solution.occupancy[r, e], leaf.grad.numpy(), atol=1e-9)
 
 
 @pytest.mark.parametrize("runs", [1, 3])
