@@ -63,9 +63,13 @@ def _by_section(request: Request) -> Any:
         case "train-expert":
             return SimpleNamespace(expert=request.parameters)
         case "train-airl":
-            # Challengers learn with the PPO of retrained policies.
+            # Challengers learn with the PPO of retrained policies, and these with that of experts.
             airl = request.parameters.airl
-            return SimpleNamespace(airl=airl, transfer=SimpleNamespace(ppo=airl.challenger.ppo))
+            ppo = SimpleNamespace(ppo=airl.challenger.ppo)
+            return SimpleNamespace(airl=airl, transfer=ppo, expert=ppo)
+        case "transfer":
+            transfer = request.parameters.transfer
+            return SimpleNamespace(transfer=transfer, expert=SimpleNamespace(ppo=transfer.ppo))
         case "sweep-maxent":
             # What the sweep varies is at its default here.
             return SimpleNamespace(maxent=request.parameters.shared)

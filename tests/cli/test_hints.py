@@ -311,6 +311,13 @@ CHALLENGED = ("airl.challenger.life=1", "airl.logit=f", "airl.policy_reward=f")
             {"transfer.total_steps=5": "7"},
         ),
         ("transfer --reward airl --ood 1.5x", ["transfer.ceiling=none"], {}),
+        ("transfer --reward airl --ood 1.5x", ["expert.ppo.n_epochs=1"], {}),
+        # The settings file gives retrained landers a gamma of their own.
+        (
+            "transfer --reward airl --ood 1.5x",
+            ["expert.ppo.gamma=0.9"],
+            {"expert.ppo.gamma=0.9": "0.99"},
+        ),
         (
             "plan figure2 --tag x",
             ["maxent.penalty_weight=3", "maxent.iterations=9"],
