@@ -248,6 +248,16 @@ def test_what_minari_holds_and_irl_cannot_use_is_named(tmp_path):
         imported(read_minari, tmp_path / "b", tmp_path / "out")
 
 
+def test_a_dataset_of_images_is_refused(tmp_path):
+    """Minari reads images by another way, which does not check where the other numbers are."""
+    images = spaces.Box(0, 255, (32, 32), np.uint8)
+    save_minari(tmp_path / "a", [], observations=images)
+    metadata = tmp_path / "a" / "metadata.json"
+    metadata.write_text(json.dumps(json.loads(metadata.read_text()) | {"jpeg_encoding": False}))
+    with pytest.raises(UsageError, match="images"):
+        imported(read_minari, tmp_path / "a", tmp_path / "out")
+
+
 @pytest.mark.parametrize("form", ["soft link", "external link", "external data", "virtual"])
 def test_numbers_outside_a_datasets_file_are_refused(tmp_path, form):
     """The key of an import covers the file itself."""

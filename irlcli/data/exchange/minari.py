@@ -138,12 +138,8 @@ def _text(name: Any) -> str:
 def _episodes(directory: Path, column: str | None) -> Iterator[_Episode]:
     """Every episode; a crafted file makes h5py raise almost anything."""
     storage = _open(directory)
-    from minari.dataset.minari_storage import is_image_space
-
-    # Minari decodes images.
-    plain = storage.FORMAT == "hdf5" and not is_image_space(storage.observation_space)
     try:
-        if plain:
+        if storage.FORMAT == "hdf5":
             yield from _from_hdf5(directory / "main_data.hdf5", storage.total_episodes, column)
         else:
             yield from _from_storage(storage)
@@ -301,6 +297,8 @@ def _open(directory: Path) -> Any:
     from gymnasium import spaces
 
     storage_class = _storage_class()
+    from minari.dataset.minari_storage import is_image_space
+
     path = directory / "metadata.json"
     try:
         if path.stat().st_size > _MAX_METADATA_BYTES:
@@ -322,4 +320,8 @@ def _open(directory: Path) -> Any:
                 f"{directory}: its {name.replace('_', ' ')} is a {type(space).__name__}",
                 "only vectors and indices can be imported; flatten them first",
             )
+    if is_image_space(storage.observation_space):
+        raise UsageError(
+            f"{directory}: its observations are images", "only vectors can be imported"
+        )
     return storage
