@@ -1,7 +1,7 @@
 """Which code defines an environment: its files, their digest and its version; nothing is imported.
 
-An installed package is known by its distribution's version. Anything else is known by its content,
-so that an edit changes every key.
+A package installed from an index is known by its distribution's version. Anything else is known by
+its content, so that an edit changes every key.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from irlcli.envs.spec import Code
 from irlcli.errors import NotFound, UsageError
 
 _INSTALLED = ("site-packages", "dist-packages")
+# Written for an installation from a directory, a file or a repository, not from an index (PEP 610).
+_ORIGIN = "direct_url.json"
 
 
 def join_path(directory: Path | None) -> None:
@@ -52,10 +54,10 @@ def code_of(module: str, files: Sequence[str], directory: Path | None, where: st
     top = module.partition(".")[0]
     root = _root(origin, module)
     found = {path.relative_to(root).as_posix(): path for path in _further(files, root, where)}
-    installed = not set(_INSTALLED).isdisjoint(origin.parts)
-    if not installed:
+    distribution = _distribution(top, root)
+    if distribution is None or distribution.read_text(_ORIGIN):
         found |= {path.relative_to(root).as_posix(): path for path in _sources(root, top, where)}
-    name, version = _distribution(top, root, installed)
+    name, version = (distribution.name, distribution.version) if distribution else (None, None)
     return Code(_digest(found) if found else None, name, version)
 
 
@@ -111,16 +113,25 @@ def _further(files: Sequence[str], root: Path, where: str) -> Iterator[Path]:
 
 
 def _sources(root: Path, module: str, where: str) -> list[Path]:
-    """The Python files of the top-level ``module``, and of those beside it that it imports."""
-    found: dict[Path, None] = {}
+    """The Python files of the top-level ``module``, and of those beside it that it imports.
+
+    Beside an installed module are its dependencies. They are other distributions, and left out.
+    """
+    own = _distribution(module, root)
+    found: list[Path] = []
+    seen: set[str] = set()
     pending = [module]
     while pending:
         name = pending.pop()
-        for path in _files(root, name):
-            if path not in found:
-                found[path] = None
-                pending += _imported(path, where)
-    return list(found)
+        if name in seen:
+            continue
+        seen.add(name)
+        files = _files(root, name)
+        other = _distribution(name, root) if files else None
+        if other is None or (own and other.name == own.name):
+            found += files
+            pending += [imported for path in files for imported in _imported(path, where)]
+    return found
 
 
 def _files(root: Path, name: str) -> list[Path]:
@@ -157,24 +168,23 @@ def _digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
 
 
-def _distribution(top: str, root: Path, installed: bool) -> tuple[str | None, str | None]:
-    """Name and version of the distribution that ``top`` belongs to; None for a loose file."""
+def _distribution(top: str, root: Path) -> importlib.metadata.Distribution | None:
+    """The distribution that ``top`` in ``root`` belongs to; None for a loose file."""
+    installed = not set(_INSTALLED).isdisjoint(root.parts)
     for name in (top, top.replace("_", "-")):
         try:
             found = importlib.metadata.distribution(name)
         except importlib.metadata.PackageNotFoundError:
             continue
         if installed or _editable_at(found, root):
-            return found.name, found.version
-    if installed:
-        for name in importlib.metadata.packages_distributions().get(top, ()):
-            return name, importlib.metadata.version(name)
-    return None, None
+            return found
+    names = importlib.metadata.packages_distributions().get(top, ()) if installed else ()
+    return importlib.metadata.distribution(names[0]) if names else None
 
 
 def _editable_at(found: importlib.metadata.Distribution, root: Path) -> bool:
     """Whether a distribution is an editable installation of a directory that holds ``root``."""
-    text = found.read_text("direct_url.json")
+    text = found.read_text(_ORIGIN)
     if not text:
         return False
     place = unquote(urlparse(json.loads(text).get("url", "")).path)

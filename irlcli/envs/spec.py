@@ -60,7 +60,7 @@ class Code(NamedTuple):
     """What is known of the code of an environment from outside the package.
 
     Attributes:
-        sha256: digest of its files; None for an installed package.
+        sha256: digest of its files; None for a package installed from an index.
         distribution, version: what it was installed from; None for a loose file.
     """
 

@@ -126,7 +126,7 @@ class OwnKey(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         id, entry_point: how it is made; one of them.
         arguments: that are the same in every setting.
         knobs: the argument of each knob that the settings change, by the knob's name.
-        sha256: digest of its code; None for an installed package.
+        sha256: digest of its code; None for a package installed from an index.
         distribution, version: what its code was installed from; None for a loose file.
     """
 

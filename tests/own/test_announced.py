@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 
 import pytest
@@ -160,3 +161,66 @@ def test_two_modules_of_one_name_are_refused(lab):
     (lab / "json.py").write_text("")
     with pytest.raises(UsageError, match="two modules are called 'json'"):
         digest(lab, "json")
+
+
+# The code of installed modules
+
+
+@pytest.fixture
+def site(fresh, tmp_path, monkeypatch):
+    """A folder of installed packages; ``site(name, module, origin)`` installs a module of one line."""
+    directory = tmp_path / "site-packages"
+    directory.mkdir()
+    monkeypatch.syspath_prepend(directory)
+    monkeypatch.chdir(tmp_path)
+
+    def install(distribution, module, origin=None, at=directory):
+        at.mkdir(exist_ok=True)
+        (at / f"{module}.py").write_text("import lab_beside\nGRAVITY = 9.8\n")
+        if distribution is not None:
+            about = directory / f"{distribution.replace('-', '_')}-1.0.dist-info"
+            about.mkdir()
+            (about / "METADATA").write_text(f"Name: {distribution}\nVersion: 1.0\n")
+            (about / "top_level.txt").write_text(f"{module}\n")
+            if origin is not None:
+                (about / "direct_url.json").write_text(json.dumps({"url": origin.as_uri()}))
+        return at / f"{module}.py"
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("distribution", "local"),
+    [("lab_arm", False), ("lab-arm", False), ("robots", False), ("robots", True), (None, False)],
+)
+def test_only_the_version_of_a_package_from_an_index_stands_for_its_content(
+    site, tmp_path, distribution, local
+):
+    file = site(distribution, "lab_arm", tmp_path if local else None)
+    before = code_of("lab_arm", (), None, "lab.toml")
+    assert before[1:] == (distribution, None if distribution is None else "1.0")
+    file.write_text("GRAVITY = 1.6\n")
+    released = distribution is not None and not local
+    assert (before.sha256 is None) == released
+    assert (code_of("lab_arm", (), None, "lab.toml") == before) == released
+
+
+@pytest.mark.parametrize(("owner", "counts"), [(None, True), ("lab", True), ("other", False)])
+def test_the_dependencies_of_an_installed_module_are_not_its_code(site, tmp_path, owner, counts):
+    site("lab", "lab_arm", tmp_path)
+    beside = site(owner if owner != "lab" else None, "lab_beside")
+    if owner == "lab":
+        (beside.parent / "lab-1.0.dist-info" / "top_level.txt").write_text("lab_arm\nlab_beside\n")
+    before = code_of("lab_arm", (), None, "lab.toml")
+    beside.write_text("GRAVITY = 1.6\n")
+    assert (code_of("lab_arm", (), None, "lab.toml") != before) == counts
+
+
+@pytest.mark.parametrize("folder", ["lab", "elsewhere"])
+def test_an_editable_package_is_known_by_version_and_content(site, tmp_path, monkeypatch, folder):
+    monkeypatch.syspath_prepend(tmp_path / "lab")
+    file = site("lab_arm", "lab_arm", tmp_path / folder, at=tmp_path / "lab")
+    before = code_of("lab_arm", (), None, "lab.toml")
+    assert before[1:] == (("lab_arm", "1.0") if folder == "lab" else (None, None))
+    file.write_text("GRAVITY = 1.6\n")
+    assert code_of("lab_arm", (), None, "lab.toml").sha256 != before.sha256
