@@ -248,7 +248,10 @@ def listed_settings(env: str, knob: str, values: Sequence[str]) -> tuple[Setting
 
 
 def check_distinct(where: str, settings: Sequence[Setting]) -> None:
-    """Refuse settings that name the same world. A knob at its default and ``default`` are two names.
+    """Refuse settings that name the same world, as ``default`` and ``mass=1x`` do.
+
+    Only the environment knows whether an absolute value is the default: ``bounce=0`` and
+    ``default`` are accepted.
 
     Raises:
         UsageError: naming ``where`` and the setting that appears twice.
@@ -264,8 +267,14 @@ def check_distinct(where: str, settings: Sequence[Setting]) -> None:
 
 
 def world(setting: Setting) -> dict[str, tuple[float, ...]]:
-    """The numbers of each knob that a setting names, equal for 10 and 10..10."""
-    return {knob: _numbers(value) for knob, value in setting.changes}
+    """The numbers of each knob that a setting changes, equal for 10 and 10..10."""
+    return {knob: _numbers(value) for knob, value in _effective(setting).changes}
+
+
+def _effective(setting: Setting) -> Setting:
+    """``setting`` without its multipliers of 1, which change nothing."""
+    unchanged = Value("multiplier", (1.0,))
+    return Setting(tuple(change for change in setting.changes if change[1] != unchanged))
 
 
 def _numbers(value: Value) -> tuple[float, ...]:
@@ -275,6 +284,7 @@ def _numbers(value: Value) -> tuple[float, ...]:
 
 def covers(wide: Setting, narrow: Setting) -> bool:
     """Whether every world of ``narrow`` is one of ``wide``, as -5 and -5..0 are of -10..0."""
+    wide, narrow = _effective(wide), _effective(narrow)
     return wide.knobs == narrow.knobs and all(
         _covers(value, other)
         for (_, value), (_, other) in zip(wide.changes, narrow.changes, strict=True)
@@ -290,6 +300,7 @@ def _covers(wide: Value, narrow: Value) -> bool:
 
 def overlap(one: Setting, other: Setting) -> bool:
     """Whether two settings share worlds: for each knob one covers the other, or ranges overlap."""
+    one, other = _effective(one), _effective(other)
     return one.knobs == other.knobs and all(
         _overlap(value, another)
         for (_, value), (_, another) in zip(one.changes, other.changes, strict=True)

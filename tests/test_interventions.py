@@ -15,6 +15,7 @@ from irlcli.errors import IrlError, UsageError, suggest
 from irlcli.interventions import (
     Setting,
     Value,
+    check_distinct,
     check_observed,
     covers,
     env_kwargs,
@@ -350,6 +351,19 @@ def test_settings_of_several_knobs_share_worlds_knob_by_knob():
     assert covers(wide, narrow) and not covers(narrow, wide)
     assert overlap(wide, narrow) and not overlap(wide, beside)
     assert not overlap(wide, parse_setting("ant", "mass=2x"))
+
+
+def test_a_multiplier_of_one_is_the_default():
+    default, once, both, other = (
+        parse_setting("ant", text)
+        for text in ("default", "mass=1x", "leg-length=2x,mass=1x", "leg-length=2x")
+    )
+    for one, same in ((default, once), (both, other)):
+        assert covers(one, same) and covers(same, one) and overlap(one, same)
+        with pytest.raises(UsageError, match=f"names {one} twice, once as {same}"):
+            check_distinct("the command", [one, same])
+    assert not overlap(once, both)
+    check_distinct("the command", [once, both])
 
 
 GRAMMAR = st.text("0123456789.xe:+-,= \n", max_size=20)
