@@ -24,7 +24,8 @@ class Ended:
         episode_return: sum of the true rewards.
         length: number of steps.
         progress: sum of ``info["progress"]``, or NaN if the environment does not report it.
-        error: ``info["error"]`` of the last step: why a simulation could not continue.
+        error: ``info["error"]`` of the last step, which it ended: why a simulation could not
+            continue.
     """
 
     world: int
@@ -88,8 +89,9 @@ class VectorWorlds:
             rewards[i] = reward
             self._returns[i] += reward
             if "progress" in info:
-                before = 0.0 if self._lengths[i] == 1 else self._progress[i]
+                before = 0.0 if np.isnan(self._progress[i]) else self._progress[i]
                 self._progress[i] = before + info["progress"]
+            truncated = truncated or info.get("error") is not None
             if terminated or truncated or self._lengths[i] >= self.max_episode_steps:
                 ended.append(
                     Ended(

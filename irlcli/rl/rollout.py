@@ -111,12 +111,12 @@ def _run_batch(
         for i, action in zip(active, chosen, strict=True):
             observation, reward, terminated, truncated, info = worlds[i].step(action)
             if "progress" in info:
-                progress[i] = (progress[i] if rewards[i] else 0.0) + info["progress"]
+                progress[i] = (0.0 if math.isnan(progress[i]) else progress[i]) + info["progress"]
             errors[i] = info.get("error")
             observations[i].append(np.asarray(observation, dtype=np.float32))
             actions[i].append(action)
             rewards[i].append(float(reward))
-            truncated = truncated or len(rewards[i]) >= limit
+            truncated = truncated or errors[i] is not None or len(rewards[i]) >= limit
             ends[i] = (bool(terminated), bool(truncated and not terminated))
             if not (terminated or truncated):
                 still.append(i)

@@ -46,6 +46,32 @@ def test_equals_single_environments_with_resets_and_time_limit():
     assert episodes >= 8
 
 
+class Breaking(gymnasium.Env):
+    """Reports progress from its second step on, and an error in its third."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        info = {"progress": 1.5} if self.steps > 1 else {}
+        if self.steps == 3:
+            info["error"] = "the simulation broke"
+        return np.zeros(1, np.float32), 1.0, False, False, info
+
+
+def test_an_error_ends_the_episode():
+    worlds = VectorWorlds([Breaking()], max_episode_steps=9)
+    worlds.reset([0])
+    (end,) = [end for _ in range(4) for end in worlds.step(np.zeros(1, int))[2]]
+    assert (end.length, end.terminated, end.error) == (3, False, "the simulation broke")
+    assert end.progress == 3.0
+
+
 def test_settings_have_equal_shares_in_order():
     worlds = make_worlds("lunar-lander", SETTINGS, 6)
     assert [env.engine_power for env in worlds.envs] == [1.0] * 3 + [1.5] * 3

@@ -250,6 +250,23 @@ def test_an_episode_that_ends_on_an_error_is_named(bench, words):
     assert "warning: mass=2x, episode 0: it fell over" in done.err
 
 
+def test_an_error_ends_an_episode_and_progress_may_begin_later(bench):
+    bench.edit(bench.module, "self.speed = 0.0", "self.speed = 0.0\n        self.steps = 0")
+    bench.edit(
+        bench.module,
+        "reward = 1.0",
+        "self.steps += 1\n"
+        "        info = {'progress': 1.5} if self.steps > 1 else {}\n"
+        "        info |= {'error': 'it fell over'} if self.steps == 3 else {}\n"
+        "        reward = 1.0",
+    )
+    bench.edit(bench.module, "> 5.0, False, {}", "> 5.0, False, info")
+    env = resolve("cart.toml").name
+    (episode,) = roll_out(env, parse_setting(env, "mass=2x"), "idle", 1, 0, "test")
+    assert (len(episode), episode.truncated, episode.error) == (3, True, "it fell over")
+    assert episode.progress == 3.0
+
+
 def test_the_example_passes_every_check(bench):
     done = bench.irl("envs", "check", "cart.toml")
     assert done.code == 0 and {line[:4] for line in done.out.splitlines()} == {"PASS"}
