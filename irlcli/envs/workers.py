@@ -17,8 +17,10 @@ import atexit
 import multiprocessing
 import os
 import signal
+import traceback
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -29,7 +31,7 @@ import gymnasium
 import numpy as np
 
 from irlcli.envs.vector import Ended, VectorWorlds
-from irlcli.errors import IrlError, StageFailed
+from irlcli.errors import IrlError, StageFailed, described
 
 _CLOSE_SECONDS = 5.0
 # Raised by a pipe whose other end is closed.
@@ -44,11 +46,16 @@ class WorkerFailed(StageFailed):
         super().__init__(message, hint or "run the same command again to resume")
 
 
+class _InWorker(Exception):
+    """The traceback of an error in a worker, the cause of a :class:`WorkerFailed`."""
+
+
 class _Failure(NamedTuple):
-    """An error in a worker, and its hint."""
+    """An error in a worker, its hint and its traceback."""
 
     message: str
     hint: str
+    traceback: str
 
 
 class _Channel(NamedTuple):
@@ -113,28 +120,28 @@ def _work(
     # react, and a worker ends when its pipe does.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2):
         signal.signal(number, signal.SIG_IGN)
-    worlds: VectorWorlds | None = None
     actions, observations, rewards = (view[worker::workers] for view in shared.views())
     try:
-        worlds = VectorWorlds([factory() for factory in factories], max_episode_steps)
-        while True:
-            seeds = channel.receive()
-            ended: list[Ended] = []
-            if seeds is None:
-                observations[:], rewards[:], ended = worlds.step(actions)
-            else:
-                observations[:] = worlds.reset(seeds)
-            ended = [replace(end, world=worker + workers * end.world) for end in ended]
-            channel.send(ended or None)
+        made = VectorWorlds([factory() for factory in factories], max_episode_steps)
+        with closing(made) as worlds:
+            while True:
+                seeds = channel.receive()
+                ended: list[Ended] = []
+                if seeds is None:
+                    observations[:], rewards[:], ended = worlds.step(actions)
+                else:
+                    observations[:] = worlds.reset(seeds)
+                ended = [replace(end, world=worker + workers * end.world) for end in ended]
+                channel.send(ended or None)
     except _CLOSED:
         pass
-    except IrlError as error:
-        channel.send(_Failure(error.message, error.hint))
     except Exception as error:
-        channel.send(_Failure(f"{type(error).__name__}: {error}", ""))
-    finally:
-        if worlds is not None:
-            worlds.close()
+        message, hint = described(error), ""
+        if isinstance(error, IrlError):
+            message, hint = error.message, error.hint
+        # If another worker failed in the same step, the parent has closed the pipe.
+        with suppress(*_CLOSED):
+            channel.send(_Failure(message, hint, f"\n{traceback.format_exc()}"))
 
 
 def _close(worlds: weakref.ref[WorkerWorlds]) -> None:
@@ -265,13 +272,14 @@ class WorkerWorlds:
             for worker, channel in enumerate(self._channels):
                 answer = channel.receive()
                 if isinstance(answer, _Failure):
-                    raise WorkerFailed(f"{self._name(worker)}: {answer.message}", answer.hint)
+                    message = f"{self._name(worker)}: {answer.message}"
+                    raise WorkerFailed(message, answer.hint) from _InWorker(answer.traceback)
                 ended += answer or []
         except BaseException as error:
             # An unread answer would be mistaken for the answer to the next request.
             failure = self._died(worker) if isinstance(error, _CLOSED) else error
             self.close()
-            raise failure from None
+            raise failure from error.__cause__
         return sorted(ended, key=lambda end: end.world)
 
     def _died(self, worker: int) -> WorkerFailed:

@@ -121,8 +121,10 @@ def test_an_environments_error_names_the_worker_and_its_worlds():
     worlds.reset([0, 0, 0])
     worlds.step(np.zeros(3, dtype=np.int64))
     message = r"worker 0 \(worlds 0, 2\): ArithmeticError: the sums do not add up"
-    with pytest.raises(WorkerFailed, match=message):
+    with pytest.raises(WorkerFailed, match=message) as failed:
         worlds.step(np.zeros(3, dtype=np.int64))
+    # With --debug: the line in the environment's own file.
+    assert "raise ArithmeticError" in str(failed.value.__cause__)
     assert wait_for_death(pids)
     with pytest.raises(WorkerFailed, match="closed"):
         worlds.step(np.zeros(3, dtype=np.int64))
@@ -142,6 +144,25 @@ def test_the_hint_of_an_environments_error_is_kept():
         worlds.step(np.zeros(2, dtype=np.int64))
     assert failed.value.message == "worker 0 (world 0): it has no floor"
     assert failed.value.hint == "give it a floor"
+
+
+class Late(Fragile):
+    """Fails after the parent has ended its workers."""
+
+    def step(self, action):
+        time.sleep(0.3)
+        raise ArithmeticError("the sums do not add up")
+
+    def close(self):
+        raise ArithmeticError("it does not close")
+
+
+def test_workers_that_fail_together_print_nothing(capfd):
+    worlds = WorkerWorlds([partial(Fragile, fail_at=1), Late], max_episode_steps=100, workers=2)
+    worlds.reset([0, 0])
+    with pytest.raises(WorkerFailed, match="worker 0"):
+        worlds.step(np.zeros(2, dtype=np.int64))
+    assert capfd.readouterr().err == ""
 
 
 def test_what_cannot_be_pickled_leaves_no_half_message():
