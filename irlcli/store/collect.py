@@ -124,11 +124,11 @@ def collect(
                 f"{layout.names / damaged[0]} is damaged, so gc does not know what the name protects",
                 f"name the artefact again: `irl name REF {damaged[0]}`",
             )
-        artefacts, work = garbage(layout, grace_seconds, warn), stale_work(layout, grace_seconds)
+        artefacts, stale = garbage(layout, grace_seconds, warn), stale_work(layout, grace_seconds)
         pointers: dict[str, list[Path]] = {}
         for pointer, id16 in claims(layout):
             pointers.setdefault(id16, []).append(pointer)
-        removed = []
+        removed, cleared = [], []
         for artefact in artefacts:
             try:
                 if not artefact.directory.is_symlink():
@@ -144,12 +144,17 @@ def collect(
             artefact.directory.rename(grave)
             remove(grave)
             removed.append(artefact)
-        for path in work:
-            remove(path)
-            _remove_lock(layout.locks / path.name)
+        for work in stale:
+            try:
+                remove(work)
+            except PermissionError:
+                warn(f"{work} belongs to another user, who can remove it")
+                continue
+            _remove_lock(layout.locks / work.name)
+            cleared.append(work)
         for directory in (layout.root, layout.keys, layout.names, layout.work, layout.locks):
             remove_leftovers(directory)
-        return removed, work
+        return removed, cleared
 
 
 def _remove_lock(path: Path) -> None:

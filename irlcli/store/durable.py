@@ -6,7 +6,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _DAY_SECONDS = 86400.0
@@ -71,7 +71,10 @@ def unique_name(stem: str) -> str:
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove what dead processes left in ``directory``: those of other machines after a day."""
+    """Remove what dead processes left in ``directory``: those of other machines after a day.
+
+    What another user's processes left is kept if only its owner can remove it.
+    """
     for path in directory.iterdir():
         owner = re.fullmatch(r".+\.(\d{1,9})\.[0-9a-f]{32}\.(.+)", path.name)
         if owner is None:
@@ -81,7 +84,8 @@ def remove_leftovers(directory: Path) -> None:
         except FileNotFoundError:
             continue
         if not alive(int(owner[1])) if owner[2] == machine() else old:
-            remove(path)
+            with suppress(PermissionError):
+                remove(path)
 
 
 def remove(path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from irlcli.errors import Busy
 from irlcli.store import Artefact, Store
+from irlcli.store.durable import machine
 from irlcli.store.lock import is_locked, locked
 
 DAY = 86400.0
@@ -156,6 +158,29 @@ def test_another_users_artefacts_are_left(empty_store, family, monkeypatch):
     assert len(said) == 1 and theirs in said[0]
     key = next(iter(empty_store.artefacts())).manifest.record.key
     assert empty_store.find(key) is not None
+
+
+def test_another_users_leftovers_are_left(empty_store, monkeypatch):
+    dead = f"copy.999999999.{'0' * 32}.{machine()}"
+    for name in ("theirs", "ours"):
+        with empty_store.working_on(name, wait=False) as scratch:
+            scratch.save(b"state")
+        age(empty_store.root / ".work" / name, 30)
+    (empty_store.root / ".work" / dead).mkdir()
+    remove = shutil.rmtree
+
+    def rmtree(path, *arguments, **options):
+        if path.name in ("theirs", dead):
+            raise PermissionError(errno.EACCES, "Permission denied", "f")
+        remove(path, *arguments, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", rmtree)
+    said = []
+    empty_store.warn = said.append
+    _, work = empty_store.collect(DAY)
+    assert [path.name for path in work] == ["ours"]
+    assert len(said) == 1 and "theirs" in said[0]
+    assert empty_store.has_checkpoint("theirs") and not empty_store.has_checkpoint("ours")
 
 
 def test_locks_of_a_group_can_be_taken_by_its_members(tmp_path):
