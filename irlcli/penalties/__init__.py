@@ -161,14 +161,14 @@ def check_risks(name: str, grouping: str, settings: int) -> None:
     if grouping == "shuffled" and settings < 2:
         raise UsageError(
             "one setting has no labels to shuffle",
-            "collect demonstrations of another setting, or use irm",
+            "train in another setting as well, or use the method irm",
         )
     if not PENALTIES[name].compares:
         return
     if settings < 2:
         raise UsageError(
             f"penalty {name!r} compares settings and needs at least two to train on, not one",
-            "--penalty irmv1 works with one, or collect demonstrations of another setting",
+            "penalty irmv1 works with one; or train in another setting as well",
         )
     if grouping not in ("per-setting", "shuffled"):
         raise UsageError(

@@ -98,7 +98,7 @@ def _candidates(
     if len(settings) < 2:
         raise UsageError(
             f"{settings[0]} is the only setting, so none can be left out",
-            "choose lambda yourself, or collect demonstrations of two other settings",
+            "set lambda instead of choosing it",
         )
     if len(candidates) < 2:
         raise UsageError(
@@ -109,7 +109,7 @@ def _candidates(
         raise UsageError(
             f"--choose-penalty leaves a setting out, and {train_airl.name(airl)} needs at least two "
             f"of the others: {len(settings)} settings are too few",
-            "choose lambda yourself, or collect demonstrations of a third setting",
+            "set lambda instead of choosing it, or train in three settings or more",
         )
     if airl.select in settings:
         raise UsageError(

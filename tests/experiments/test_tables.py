@@ -228,6 +228,19 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         assert "--out" in refused(command, "demo", "--out", "")
     assert "--until makes no report" in refused("run", "demo", "--until", "demos", "--out", "x")
     assert "--only takes no --until" in refused("run", "demo", "--only", "x", "--until", "demos")
+    one_too_few = [
+        "table1",
+        "--choose-penalty",
+        "own",
+        "--tag",
+        "x",
+        "--rows",
+        "lunar-lander.bounce",
+    ]
+    for method in ("irm-shuffled", "group-dro"):
+        told = refused("plan", *one_too_few, "--methods", method)
+        assert f"lunar-lander.bounce {method}: " in told and "2 settings are too few" in told
+        assert "--" not in told.splitlines()[-1]
     assert "--choose-penalty" in refused("run", "experts", "--choose-penalty", "1,2", "--tag", "x")
     own = tmp_path / "mine.toml"
     own.write_text(SOUND.replace("leg-length", "leg-lenght"))
