@@ -56,11 +56,13 @@ class ClusterOptions(NamedTuple):
     jobs: int | None
 
     def check_used(self, detach: bool) -> None:
-        """Refuse options that a run with this ``--cluster`` would ignore.
+        """Refuse malformed options, and those that a run with this ``--cluster`` would ignore.
 
         Raises:
             UsageError: names the first of them.
         """
+        if self.cluster is not None and self.cluster not in CLUSTERS:
+            raise UsageError(f"unknown --cluster {self.cluster!r}", suggest(self.cluster, CLUSTERS))
         slurm = {
             "--partition": self.partition is not None,
             "--cpus": self.cpus is not None,
@@ -92,21 +94,22 @@ class ClusterOptions(NamedTuple):
                 f"--cluster local requeues a job at most {LOCAL_REQUEUES} times",
                 f"--requeues {LOCAL_REQUEUES} or less; the same command again resumes",
             )
+        if self.time is not None:
+            parse_minutes(self.time)
+        _sbatch_options(self.sbatch)
 
 
 def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     """The queue that ``--cluster`` names.
 
     Raises:
-        UsageError: an unknown name or option, or Slurm or submitit is missing.
+        UsageError: Slurm or submitit is missing.
     """
     from irlcli.experiments.cluster.local import Local
     from irlcli.experiments.cluster.slurm import Slurm
 
     cluster = options.cluster
     assert cluster is not None
-    if cluster not in CLUSTERS:
-        raise UsageError(f"unknown --cluster {cluster!r}", suggest(cluster, CLUSTERS))
     if importlib.util.find_spec("submitit") is None:
         raise UsageError(
             "--cluster needs the package submitit, which is not installed",
@@ -121,13 +124,22 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
         options.cpus or DEFAULTS.cpus,
         options.parallelism or DEFAULTS.parallelism,
         warning,
-        dict(_sbatch_option(item) for item in options.sbatch),
+        _sbatch_options(options.sbatch),
     )
     return Slurm(resources) if cluster == "slurm" else Local(session.store, resources)
 
 
+def _sbatch_options(items: Sequence[str]) -> dict[str, str]:
+    """The values of ``--sbatch OPTION=VALUE``, repeated, by name."""
+    found: dict[str, str] = {}
+    for name, value in map(_sbatch_option, items):
+        if name in found:
+            raise UsageError(f"--sbatch {name} is given twice", f"give {name} once")
+        found[name] = value
+    return found
+
+
 def _sbatch_option(item: str) -> tuple[str, str]:
-    """Name and value of ``--sbatch OPTION=VALUE``."""
     name, equals, value = item.partition("=")
     if name in _SET_BY_IRL:
         option = _SET_BY_IRL[name]

@@ -259,8 +259,8 @@ def _check_options(
     Raises:
         UsageError: names them.
     """
-    if choice.only is not None and (choice.until or directory or options.jobs):
-        raise UsageError("--only takes no --until, --out or --jobs", "omit them: it makes one step")
+    if choice.only is not None and (directory or options.jobs):
+        raise UsageError("--only takes no --out or --jobs", "omit them: it makes one step")
     if about_jobs and (directory or options.jobs):
         raise UsageError(f"--{about_jobs} makes no step", "omit --out and --jobs")
     if choice.until is not None and directory is not None:

@@ -31,7 +31,8 @@ def collect_experts(
     """Demonstrations of the expert of each setting.
 
     Raises:
-        UsageError: no setting is named, or one is malformed or named twice.
+        UsageError: no setting is named, or one is malformed or named twice; ``trust`` without
+            ``expert``.
         NotFound: no such environment or expert.
     """
     if intervention is None and not setting:
@@ -39,6 +40,8 @@ def collect_experts(
             "neither --intervention nor --setting names a setting",
             "give --intervention KNOB=VALUE,VALUE or --setting KNOB=VALUE,KNOB=VALUE",
         )
+    if trust and not expert:
+        raise UsageError("--trust needs --expert, whose files it is about", "omit --trust")
     env = resolve(env).name
     config = session.config(env)
     settings = arguments.where(None, intervention, setting).settings(env, config)

@@ -96,12 +96,14 @@ def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
 
     Raises:
         UsageError: an unknown table, row, method, phase or step, a lambda that the table lists
-            itself, or another bad option.
+            itself, or another bad or contradictory option.
     """
     from irlcli.experiments.plan import Plan, Selection
     from irlcli.experiments.rows import PHASES
     from irlcli.experiments.tables import load_table, narrowed
 
+    if choice.only is not None and choice.until is not None:
+        raise UsageError("--only takes no --until", "omit --until: --only names one step")
     if choice.file is not None:
         check_path(choice.file, "--experiments")
     table = load_table(choice.table, choice.file)

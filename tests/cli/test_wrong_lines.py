@@ -98,6 +98,7 @@ WRONG = [
     (f"collect-experts {LANDER} --episodes 1,2", 2, "2 episode counts"),
     (f"collect-experts {LANDER} --episodes ''", 2, "--episodes"),
     (f"collect-experts {LANDER} --episodes 1_0", 2, "'1_0'"),
+    (f"collect-experts {LANDER} --trust", 2, "--trust"),
     (f"collect-experts {LANDER} --seed -1", 2, "-1"),
     (f"collect-experts {LANDER} --seed x", 2, "x"),
     (f"collect-experts {LANDER} --seed 1.5", 2, "1.5"),

@@ -227,7 +227,9 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         assert "has a README.md" in refused(command, "demo", "--out", tmp_path)
         assert "--out" in refused(command, "demo", "--out", "")
     assert "--until makes no report" in refused("run", "demo", "--until", "demos", "--out", "x")
-    assert "--only takes no --until" in refused("run", "demo", "--only", "x", "--until", "demos")
+    for command in ("plan", "run"):
+        both = refused(command, "demo", "--only", "x", "--until", "demos")
+        assert "--only takes no --until" in both
     one_too_few = [
         "table1",
         "--choose-penalty",
