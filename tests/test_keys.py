@@ -27,6 +27,7 @@ from irlcli.experiments.bank import Policies, Retrained, bank
 from irlcli.interventions import parse_settings
 from irlcli.learners import LEARNERS
 from irlcli.penalties import PENALTIES
+from irlcli.requests.overrides import behind
 from irlcli.rl import ALGORITHMS
 from irlcli.stages import (
     assess,
@@ -382,6 +383,17 @@ def a_second_learner_algorithm_and_penalty(monkeypatch):
     monkeypatch.setitem(LEARNERS, "other", LEARNERS["airl"])
     monkeypatch.setitem(ALGORITHMS, "other", ALGORITHMS["ppo"])
     monkeypatch.setitem(PENALTIES, "other", PENALTIES["irmv1"])
+
+
+@pytest.mark.parametrize("stage", sorted(REQUESTS.keys() - {"figure2", "control"}))
+def test_a_stage_reads_the_sections_that_its_key_depends_on(stage):
+    """And a few more: the PPO of challengers, the default of demonstrations, the noise of a bank."""
+    request, fields = REQUESTS[stage]
+    sections = {field.partition(".")[0] for field in fields}
+    read = {
+        part.partition(".")[0] for made in behind(request(in_use())) for part in made.stage.reads
+    }
+    assert sections <= read <= sections | {"transfer", "demonstrations", "assessment"}
 
 
 def test_every_stage_is_covered():

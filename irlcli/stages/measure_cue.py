@@ -76,4 +76,4 @@ def run(job: Job) -> None:
     write_json(job.output / "cue.json", msgspec.to_builtins(contrast))
 
 
-STAGE = Stage("measure-cue", 2, run, reads=("evaluation",))
+STAGE = Stage("measure-cue", 2, run, reads=())

@@ -93,4 +93,4 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", means)
 
 
-STAGE = Stage("record", 1, run, reads=("assessment",))
+STAGE = Stage("record", 1, run, reads=("assessment", "evaluation"))
