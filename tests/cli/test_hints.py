@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 import typer
@@ -138,10 +139,19 @@ def test_what_a_reference_may_be_is_in_the_hint(irl, store_copy):
     assert "irl train-airl" in hint(store_copy.airl)
 
 
-def session(store, profile="standard", overrides=(), sources=()):
-    fixed = {"file": None, "sources": sources, "dry_run": True, "wait": True, "workers": 1}
+def session(store, profile="standard", overrides=(), sources=(), workers=1, tensorboard=None):
     return StageSession(
-        store, False, profile=profile, overrides=overrides, quiet=True, tensorboard=None, **fixed
+        store,
+        False,
+        profile=profile,
+        file=None,
+        overrides=overrides,
+        sources=sources,
+        dry_run=True,
+        wait=True,
+        workers=workers,
+        quiet=True,
+        tensorboard=tensorboard,
     )
 
 
@@ -167,6 +177,13 @@ def test_other_processes_are_told_the_store_unless_it_is_everybodys_default(tmp_
     monkeypatch.setenv("IRL_STORE", "other")
     assert session("other").place_words() == ["--store", "other"]
     assert session("runs").place_words() == ["--store", "runs"]
+
+
+def test_other_processes_have_the_workers_and_the_tensorboard_of_the_command(monkeypatch):
+    monkeypatch.delenv("IRL_STORE", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    words = session("runs", workers=3, tensorboard=Path("logs")).place_words()
+    assert words == ["--workers", "3", "--tensorboard", "logs"]
 
 
 def test_the_command_that_trains_a_missing_expert_can_be_typed_as_it_stands(irl, store_copy):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
@@ -48,6 +49,20 @@ def test_a_run_says_which_steps_resume(capsys):
     shown = jobs.PlainJobs(console.TerminalConsole())
     shown.line("standard.step", "RESUME train-airl erm seed 0")
     assert "RESUME standard.step" in capsys.readouterr().err
+
+
+def test_a_job_shows_its_progress_once_a_minute(monkeypatch, capsys):
+    now = 0.0
+    monkeypatch.setattr("irlcli.cli.jobs.time", SimpleNamespace(monotonic=lambda: now))
+    shown = jobs.PlainJobs(console.TerminalConsole())
+    shown.start("step")
+    for now in (30.0, 61.0, 90.0, 122.0):
+        shown.line("step", f"  stage: {now:.0f}/200 rounds")
+    assert capsys.readouterr().err.splitlines() == [
+        "RUN step",
+        "  step: 61/200 rounds",
+        "  step: 122/200 rounds",
+    ]
 
 
 def test_ls_shows_the_method_behind_transfers_and_evaluations(irl, store_copy):

@@ -216,12 +216,21 @@ def test_a_failed_step_stops_only_what_depends_on_it(runs, tmp_path):
 
 def test_a_figure_of_failed_steps_is_not_drawn(irl, tmp_path, monkeypatch):
     """Drawing it would compute them in the process of `irl run` itself."""
-    failed = {"smoke.figure2.sweep": Failure(1, "it was asked to fail", "do not ask for it")}
+    why = Failure(1, "it was asked to fail", "do not ask for it")
+    failed = {f"smoke.figure2.{step}": why for step in ("sweep", "a", "b", "c", "d")}
     outcome = Outcome([], [], [], failed, [], False)
     monkeypatch.setattr("irlcli.cli.experiments._make_all", lambda *_: outcome)
     monkeypatch.setattr(Runner, "run", lambda *_: pytest.fail("a step was computed"))
     done = irl("run", "figure2", "--profile", "smoke", "--store", tmp_path / "runs")
     assert done.code == 1 and "steps failed: smoke.figure2.sweep" in done.err
+    assert "and 2 more" in done.err
+
+
+@pytest.mark.parametrize(("codes", "worst"), [((1, 4), 4), ((75, 2), 2), ((130, 3, 99), 99)])
+def test_the_exit_code_is_that_of_the_worst_failure(codes, worst):
+    """A code that is none of an error's is that of a crash."""
+    failed = {f"step {code}": Failure(code, "", "") for code in codes}
+    assert Outcome(failed=failed).exit_code == worst
 
 
 def test_a_damaged_artefact_is_set_aside_and_then_made_again(uninterrupted, runs, tmp_path):
@@ -275,6 +284,7 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
         out, errors = process.communicate(timeout=600)
         assert (process.returncode, out) == (130, "")
         assert "error: stopped: " in errors and "same command again" in errors
+        assert " failed: " not in errors
         computing = {line["pid"] for line in runs.lines()[begin:] if "computes" in line}
         ended = {line["pid"] for line in runs.lines()[begin:] if "exits" in line}
         assert (computing <= ended) == (count == 1)

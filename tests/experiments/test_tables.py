@@ -211,7 +211,14 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     assert "did you mean 'smoke.lunar-lander.bounce.irm.0.transfer'" in refused(
         "run", "table1", "--profile", "smoke", "--only", step
     )
-    assert "--tag NAME" in refused("run", "table1", "--set", "airl.penalty_weight=3")
+    (tmp_path / "empty.toml").touch()
+    for other in (
+        ("--set", "airl.penalty_weight=3"),
+        ("--settings", tmp_path / "empty.toml"),
+        ("--choose-penalty", "1,10"),
+    ):
+        for command in ("plan", "run"):
+            assert "--tag NAME" in refused(command, "table1", "--methods", "irm", *other)
     for command in ("plan", "run"):
         assert "cannot begin a name" in refused(command, "table1", "--tag", "a b")
     assert "the list is empty" in refused("plan", "table1", "--methods", "")

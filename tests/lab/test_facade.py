@@ -14,6 +14,7 @@ import typer
 import irlcli
 from irlcli.cli.app import app
 from irlcli.errors import Interrupted, NotFound, UsageError
+from irlcli.lab.arguments import words
 from irlcli.lab.display import NotebookConsole
 from irlcli.store import Store
 
@@ -84,6 +85,11 @@ def test_every_option_of_a_command_is_an_argument(command):
     general |= {"tensorboard", "dry_run", "as_json", "debug", "to"}
     arguments = set(inspect.signature(COMMANDS[command]).parameters) - {"self", "configs"}
     assert arguments == {option.name for option in found.params} - general
+
+
+def test_a_recorded_command_says_what_a_call_turned_off():
+    assert words("train-airl", {"state_only": False}) == ["irl", "train-airl", "--no-state-only"]
+    assert words("collect-experts", {"trust": False}) == ["irl", "collect-experts"]
 
 
 def test_a_call_may_set_a_field_of_the_labs(lab):
