@@ -248,7 +248,7 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     ]
     for method in ("irm-shuffled", "group-dro"):
         told = refused("plan", *one_too_few, "--methods", method)
-        assert f"lunar-lander.bounce {method}: " in told and "2 settings are too few" in told
+        assert f"lunar-lander.bounce, {method}: " in told and "2 settings are too few" in told
         assert "--" not in told.splitlines()[-1]
     assert "--choose-penalty" in refused("run", "experts", "--choose-penalty", "1,2", "--tag", "x")
     own = tmp_path / "mine.toml"
