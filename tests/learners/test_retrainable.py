@@ -260,6 +260,11 @@ def test_challengers_per_setting_share_the_worlds_in_the_order_of_the_settings(
     assert refused.code == 2 and "airl.challenger.ppo: one world and one step" in refused.err
 
 
+def numbers_of(demos):
+    """All numbers in the observations of ``demos``."""
+    return np.concatenate([t.observations.ravel() for group in demos for t in group])
+
+
 def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
     """Before the update a challenger's sample tells itself by its numbers: all are of one policy."""
     config = replace(CHALLENGED["challenger"], mixed_share=1.0)
@@ -275,6 +280,8 @@ def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
     )
     assert all(found <= acted for found in students)
     assert not any(found <= challenged_ for found in theirs)
+    own = np.concatenate([numbers_of(demos), *(r.observations.ravel() for r in challenge)])
+    assert all(np.isin(part.observations[:, 0], own).all() for _, part, _ in seen)
 
 
 def test_a_challenger_is_paid_the_bounded_reward(demos):
@@ -311,7 +318,10 @@ def test_a_challengers_absorbing_state_earns_a_series_in_its_own_discount(demos)
 
 
 def test_past_challengers_are_replayed_beside_the_present_one(demos, monkeypatch):
-    """The challengers of round k are made to be at 5 + k; the student's past stays apart."""
+    """The challengers of round k are made to be at 5 + k; the student's past stays apart.
+
+    Both are told from the demonstrations.
+    """
     trainer, learner, challengers = challenged(demos)
     drawn, original = [], airl.sample_minibatch
 
@@ -333,8 +343,10 @@ def test_past_challengers_are_replayed_beside_the_present_one(demos, monkeypatch
     for stratum in challenger:
         assert (stratum.policy.observations == 6.0).all()
         assert (stratum.past.observations == 5.0).all()
-    for stratum in student:
+    for stratum, other in zip(student, challenger, strict=True):
         assert not (stratum.past.observations == 5.0).all(-1).any()
+        assert torch.equal(other.expert.observations, stratum.expert.observations)
+        assert np.isin(other.expert.observations, numbers_of(demos)).all()
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
@@ -358,6 +370,24 @@ def test_the_share_of_challengers_is_taken_from_the_student(demos, share):
         for batch in (student, challengers)
     )
     torch.testing.assert_close(total, (1.0 - share) * own + share * other)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_group_dro_divides_what_challengers_leave_among_the_settings(demos, share):
+    """The loss is (1 - share) sum q_e R_e, with q_e proportional to exp(50 R_e), and the challengers'."""
+    challenger = replace(CHALLENGED["challenger"], share=share)
+    changes = {"grouping": "per-setting", "penalty": "group-dro", "challenger": challenger}
+    _, learner, _ = challenged(demos, **changes)
+    batches = [a_batch(size, observations=8, actions=4) for size in (6, 10)]
+    arguments = (torch.full((2,), 0.5), learner.config, 50.0, torch.Generator())
+    total = discriminator.minibatch_loss(learner.model, *batches, *arguments).total
+    risks, other = (
+        cross_entropy(discriminator.discriminator_logits(learner.model, batch, "f")[0])
+        for batch in batches
+    )
+    shares = (50.0 * risks).softmax(0)
+    expected = (1.0 - share) * (shares * risks).sum() + share * other.mean()
+    torch.testing.assert_close(total, expected)
 
 
 def test_challengers_are_negatives(demos):
