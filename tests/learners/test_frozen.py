@@ -23,7 +23,7 @@ from irlcli.learners.pools import make_pool
 from irlcli.learners.reward_model import RewardModel, build
 from irlcli.learners.scoring import reward_quantiles, transformed_reward
 from irlcli.rl.rollout import roll_out
-from irlcli.trajectories import ActionSpace, Trajectory, Transitions
+from irlcli.trajectories import ActionSpace, Trajectory, Transitions, transitions
 
 
 def by_hand(path, about):
@@ -199,6 +199,9 @@ def test_actions_are_clipped_where_the_reward_saw_them_so(tmp_path, actions, sec
     # Without absorbing states the last observation earns nothing.
     expected = (2 * 1.0 + 3 * -1.0 + 2 * 2.0 + 3 * second) / 2.0
     assert reward.of_episode(episode) == pytest.approx(expected, rel=1e-5)
+    steps = transitions([episode], 1000)
+    each = reward.of_transitions(steps.observations, steps.actions, steps.next_observations)
+    assert each.tolist() == pytest.approx([-0.5, (2 * 2.0 + 3 * second) / 2.0])
 
 
 def test_what_the_reward_cannot_measure_is_refused(tmp_path, smoke_store):

@@ -21,7 +21,7 @@ from irlcli.configs import AIRLConfig, ChallengerConfig, PPOConfig
 from irlcli.configs.relevance import relevant_airl
 from irlcli.data.outputs import write_reward
 from irlcli.data.tensors import load_reward_file
-from irlcli.errors import UsageError
+from irlcli.errors import StageFailed, UsageError
 from irlcli.learners import airl, discriminator
 from irlcli.learners.pools import Minibatch
 from irlcli.learners.replay import whole_episodes
@@ -179,6 +179,19 @@ def challenged(demos, **changes):
     config = learner.config.challenger
     worlds = worlds_of(SETTINGS, LONG.n_envs, HORIZON)
     return trainer, learner, Challengers([worlds], config, learner, 0, "test")
+
+
+def test_a_challenger_that_diverges_is_named(demos, monkeypatch):
+    """Each lives two rounds, so that of round 3 began in round 2."""
+    _, learner, challengers = challenged(demos)
+    for index in range(3):
+        challengers.train_round(index)
+    monkeypatch.setattr(
+        learner, "challenger_rewards", lambda r: np.full(r.terminated.shape, np.nan)
+    )
+    with pytest.raises(StageFailed, match="challenger that began in round 2: ") as failed:
+        challengers.train_round(3)
+    assert "airl.challenger.ppo" in failed.value.hint
 
 
 def test_a_challengers_learning_rate_falls_over_its_life(demos):

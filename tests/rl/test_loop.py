@@ -9,7 +9,7 @@ from irlcli.rl.loop import LastRound, NoLearner, Training
 from irlcli.trajectories import Rollout
 
 
-def an_episode(episode_return, progress, terminated):
+def an_episode(episode_return, progress, terminated, errors=()):
     """Of two steps, in each of two worlds."""
     ends = np.array([[False, False], [True, True]])
     nothing = np.zeros((2, 2, 1), dtype=np.float32)
@@ -24,7 +24,7 @@ def an_episode(episode_return, progress, terminated):
         lengths=2 * ends,
         returns=np.where(ends, episode_return, 0.0),
         progress=np.where(ends, progress, 0.0),
-        errors=(),
+        errors=errors,
     )
 
 
@@ -57,8 +57,11 @@ class Counting:
 class FakeChallengers:
     """Whose episodes return 16 and progress by 32."""
 
+    def __init__(self, errors=()):
+        self.errors = errors
+
     def train_round(self, index):
-        return [an_episode(16.0, 32.0, [False, False])]
+        return [an_episode(16.0, 32.0, [False, False], self.errors)]
 
 
 class FixedReward(NoLearner):
@@ -88,6 +91,15 @@ def test_a_row_holds_what_the_challenger_earned():
     for row in training(challengers=FakeChallengers()).run(lambda *_: None, pytest.fail):
         assert (row["challenger_return"], row["challenger_progress"]) == (16.0, 32.0)
         assert (row["true_return"], row["progress"]) == (7.0, 9.0)
+
+
+def test_an_error_in_a_challengers_world_is_named():
+    warnings = []
+    challengers = FakeChallengers(((1, "the state is not finite"),))
+    training(challengers=challengers).run(lambda *_: None, warnings.append)
+    assert len(warnings) == 5
+    named = "other, the challenger's world 1, round 0: the state is not finite"
+    assert warnings[0].startswith(named)
 
 
 def test_a_resumed_run_remembers_the_best_round():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from falling import Falling
 
 from irlcli.configs import SACConfig
@@ -11,6 +12,7 @@ from irlcli.errors import StageFailed
 from irlcli.interventions import parse_settings
 from irlcli.rl.policy import describe, load_policy
 from irlcli.rl.ppo import TrueReward
+from irlcli.rl.reward_normaliser import RunningDeviation
 from irlcli.rl.rollout import roll_out
 from irlcli.rl.sac import SACTrainer
 from irlcli.rl.worlds import make_worlds
@@ -46,12 +48,13 @@ def make_trainer(seed=0, worlds=None, **changes):
 
 
 def test_random_actions_come_first():
-    """Those of the first round do not depend on the actor, those of the second do."""
+    """Those of the first round do not depend on the actor, which does not learn yet; the second's do."""
     trainer, other = make_trainer(), make_trainer(activation="tanh")
-    (random, learned), (same, different) = (
-        [t.train_round(index, TrueReward())[0].actions for index in range(2)]
-        for t in (trainer, other)
-    )
+    before = [parameter.clone() for parameter in trainer.model.policy.parameters()]
+    random, same = (t.train_round(0, TrueReward())[0].actions for t in (trainer, other))
+    after = trainer.model.policy.parameters()
+    assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
+    learned, different = (t.train_round(1, TrueReward())[0].actions for t in (trainer, other))
     assert np.abs(random).max() <= 1.0
     assert np.array_equal(random, same) and not np.array_equal(learned, different)
     assert sum(len(r.terminated) for r in trainer.train_round(2, TrueReward())) == 160
@@ -106,6 +109,10 @@ def test_discounted_sums_of_rewards_end_with_their_episode():
             sums[t] += 0.9 * sums[t - 1]
     sampled = trainer.model.replay_buffer.sample(2000).rewards.numpy()
     assert np.abs(sampled).max() == pytest.approx(np.abs(raw).max() / sums.std(), rel=1e-3)
+
+
+def test_rewards_beyond_ten_deviations_are_cut():
+    assert RunningDeviation(0.9, 1).normalise(np.array([-1e6, 1e6])).tolist() == [-10.0, 10.0]
 
 
 def test_the_networks_share_the_moments_of_all_observations():
@@ -174,6 +181,7 @@ def test_not_a_number_in_the_rewards_is_a_named_failure():
         ("gamma", 0.7),
         ("batch_size", 16),
         ("buffer_size", 800),
+        ("ent_coef", 0.1),
     ],
 )
 def test_the_library_has_the_configs_value(field, value):

@@ -132,6 +132,16 @@ def test_every_method_trains_and_is_found_again(run, demos, method):
     assert all(0.0 <= row["goal_probability"] <= 1.0 for row in quality)
 
 
+@pytest.mark.parametrize(("episodes", "reveals"), [("3", False), ("20,5,2", True)])
+def test_shuffled_labels_that_reveal_the_settings_are_named(run, episodes, reveals):
+    """Two episodes cannot be dealt out to three groups."""
+    line = ["--env", "gridworld", "--intervention", "path-group=1,2,3", "--episodes", episodes]
+    demos = Path(run("collect-experts", *line).out.strip()).name
+    done = run("train-maxent", "--demos", demos, "--method", "irm-shuffled", "--seed", "5")
+    assert done.code == 0 and "RUN" in done.err
+    assert ("warning: shuffled labels" in done.err) == reveals
+
+
 def test_methods_differ(run, demos):
     assert len({run("train-maxent", "--demos", "demos", *m).out for m in METHODS}) == len(METHODS)
 

@@ -17,6 +17,7 @@ from irlcli.learners.frozen import FrozenReward
 from irlcli.requests.arguments import warn_of_seen
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.sac import SACTrainer
+from irlcli.stages.base import environment_key, frozen_reward
 from irlcli.store import Store
 
 
@@ -260,6 +261,27 @@ def test_the_restart_with_the_highest_learned_return_is_kept(runs, irl, monkeypa
     score = irl("evaluate", "--policy", "best", "--reward", "airl", *common(runs))
     assert score.code == 0 and "best of 3" in score.err
     assert "6,144 steps" in irl("ls", "--store", runs).out
+
+
+def test_restarts_are_measured_under_the_ceiling(runs, irl, monkeypatch):
+    seen, original = [], FrozenReward.of_episode
+
+    def spied(self, trajectory):
+        seen.append(trajectory)
+        return original(self, trajectory)
+
+    monkeypatch.setattr(FrozenReward, "of_episode", spied)
+    low = ["--set", "transfer.ceiling=0.1", "--set", "transfer.total_steps=1024"]
+    artefact = made(runs, irl(*RESTARTS[:-1], "transfer.restarts=2", *low, *common(runs)))
+    model, origin = load_reward_file(Store(runs).resolve("airl").artefact.directory / "reward.pt")
+    about = json.loads((artefact.directory / "policy.json").read_text())
+    where = environment_key("half-cheetah"), about["settings"][0], model, origin
+    bounded, unbounded = (
+        [original(frozen_reward(*where, ceiling), trajectory) for trajectory in seen]
+        for ceiling in (0.1, None)
+    )
+    assert about["restarts"] == pytest.approx(np.reshape(bounded, (2, -1)).mean(1))
+    assert (np.array(unbounded) > bounded).all()
 
 
 def test_one_restart_is_the_policy_without(runs, irl):
