@@ -204,7 +204,9 @@ def test_figure_and_table(run, store):
     assert {r["setting"] for r in rows} == {*GROUPS, *UNSEEN, "worst"}
     assert all(float(r["low"]) <= float(r["mean"]) <= float(r["high"]) for r in rows)
     page = (artefact / "README.md").read_text()
-    assert sum(line.startswith("| ") for line in page.splitlines()) == 2 + len(names)
+    table, _, paired = page.partition("## Paired differences")
+    assert sum(line.startswith("| ") for line in table.splitlines()) == 2 + len(names)
+    assert "| irm irmv1 0.01 | irm-shuffled irmv1 0.01 | " in paired
     assert "20 episodes in path-group=1" in page and page in first.err
     plan = run("report", "figure2", "--dry-run").out.splitlines()
     assert len(plan) == 4 and all(line.startswith("HIT") for line in plan)
