@@ -102,14 +102,14 @@ def file_failure(error: OSError) -> StageFailed:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of any exception's message, or its class if it has none."""
-    return (str(error) or type(error).__name__).splitlines()[0]
+    """The first line with text of any exception's message, or its class if it has none."""
+    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def described(error: BaseException) -> str:
     """The class of any exception, and the first line of its message if it has one."""
     name = type(error).__name__
-    return f"{name}: {first_line(error)}" if str(error) else name
+    return f"{name}: {first_line(error)}" if str(error).strip() else name
 
 
 _KINDS = {

@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
-from irlcli.errors import StageFailed, UsageError, described
+from irlcli.errors import StageFailed, UsageError, described, first_line
 
 # The largest that the description of a reward or a policy may hold.
 _LARGEST_OBSERVATION = 4096
@@ -44,9 +44,16 @@ class Adapted(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, name: str):
         super().__init__(env)
         self._name = name
-        self.observation_space = _flat_observations(env.observation_space, name)
-        self.action_space = _flat_actions(env.action_space, name)
-        self._actions: Any = env.action_space
+        try:
+            observations, actions = env.observation_space, env.action_space
+        except AttributeError as error:
+            raise UsageError(
+                f"{name}: {first_line(error)}",
+                "every environment has an observation_space and an action_space",
+            ) from error
+        self.observation_space = _flat_observations(observations, name)
+        self.action_space = _flat_actions(actions, name)
+        self._actions: Any = actions
 
     @prints_aside()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -67,6 +74,13 @@ class Adapted(gymnasium.Wrapper):
             raise self._wrong("step", f"returned the reward {reward}")
         ends = self._flag("terminated", terminated), self._flag("truncated", truncated)
         return self._seen(observation, "step"), reward, *ends, self._reported(info)
+
+    @prints_aside()
+    def close(self) -> None:
+        try:
+            self.env.close()
+        except (Exception, SystemExit) as error:
+            raise self._failed("close", error) from error
 
     def _taken(self, action: Any) -> Any:
         """``action`` as the environment takes it: of its type, within its bounds, and a copy."""

@@ -70,15 +70,14 @@ def _outcome(what: str, run: Callable[[], object]) -> Found:
             wrong = ""
         except (_Wrong, IrlError) as error:
             wrong = first_line(error)
-    own = [w for w in caught if issubclass(w.category, UserWarning)]
-    return Found(what, wrong, tuple(dict.fromkeys(_plain(str(w.message)) for w in own)))
+    own = [w.message for w in caught if isinstance(w.message, UserWarning)]
+    return Found(what, wrong, tuple(dict.fromkeys(map(_plain, own))))
 
 
-def _plain(text: str) -> str:
-    """A warning of gymnasium without its colours."""
-    return (
-        text.replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ").splitlines()[0]
-    )
+def _plain(message: BaseException) -> str:
+    """The first line of an error or a warning, without gymnasium's colours."""
+    line = first_line(message).replace("\x1b[33m", "").replace("\x1b[0m", "")
+    return line.removeprefix("WARN: ")
 
 
 def _ends(knob: Knob) -> list[Value]:
@@ -119,7 +118,7 @@ def _check_env(spec: EnvironmentSpec) -> None:
             check_env(inner, skip_render_check=True)
         except (Exception, SystemExit) as error:
             # It asserts, and an environment can raise anything.
-            raise _Wrong(_plain(first_line(error))) from error
+            raise _Wrong(_plain(error)) from error
 
 
 def _check_seeds(spec: EnvironmentSpec) -> None:

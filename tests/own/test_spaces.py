@@ -44,6 +44,7 @@ FORCE = "float(np.clip(action, -1.0, 1.0)[0])"
         ("import numpy as np", "import numpy as np\nimport nothing_here", "'nothing_here'"),
         ('"Cart-v0"', '"Cart-v1"', "env.id"),
         ("self.drag = drag", "raise RuntimeError('no drag\\ntoday')", "RuntimeError: no drag"),
+        (f"observation_space = {OBSERVATIONS}", "", "no attribute 'observation_space'"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(bench, old, new, named):
@@ -62,6 +63,16 @@ def test_what_does_not_fit_is_refused_by_name(bench, old, new, named):
             "reward = 1.0",
             "raise KeyError('wheel')\n        reward = 1.0",
             "raised KeyError: 'wheel'",
+        ),
+        (
+            "reward = 1.0",
+            "raise AssertionError('\\nno wheel')\n        reward = 1.0",
+            "raised AssertionError: no wheel",
+        ),
+        (
+            "def _observation",
+            "def close(self):\n        raise RuntimeError('stuck')\n\n    def _observation",
+            "close() raised RuntimeError: stuck",
         ),
         ("reward = 1.0", "reward = np.nan", "returned the reward nan"),
         (RETURNED, "return np.zeros(3, np.float32)", "observation of size 3, but its space has"),
@@ -291,7 +302,14 @@ def test_the_example_passes_every_check(bench):
             "too much",
         ),
         ("mass_scale=1.0", "mass_scale_=1.0", "mass: its bounds can be made", "mass_scale"),
-        ("self.drag = drag", "raise ValueError('broken')", "it can be made", "broken"),
+        ("self.drag = drag", "raise ValueError('\\nbroken')", "it can be made", "broken"),
+        (
+            "self.position = self",
+            "import warnings\n        warnings.warn('')\n        assert seed is None, '\\nseeded'\n"
+            "        self.position = self",
+            "it can be made",
+            "seeded",
+        ),
         ("self.drag = drag", "raise SystemExit(3)", "it can be made", "SystemExit"),
         (
             "reward = 1.0",
