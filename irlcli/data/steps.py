@@ -271,6 +271,7 @@ class Check:
             _refuse(steps, bad, f"action is not one of the {listed}", "check --env")
 
     def _check_numbers(self, steps: Steps) -> None:
+        largest = float(np.finfo(np.float32).max)
         for name, array in (
             ("obs", steps.observations),
             ("next_obs", steps.next_observations),
@@ -279,9 +280,9 @@ class Check:
         ):
             if array is None or array.dtype == np.int64:
                 continue
-            # One number tells whether any is not finite.
-            if not np.isfinite(array.sum(dtype=np.float64)):
-                bad = ~np.isfinite(array).reshape(len(array), -1).all(1)
+            # Two numbers tell whether any is too large, or NaN.
+            if not -largest <= array.min() <= array.max() <= largest:
+                bad = ~(np.abs(array) <= largest).reshape(len(array), -1).all(1)
                 _refuse(steps, bad, f"{name} is not finite", "numbers must be finite in float32")
 
     def _check_order(self, steps: Steps) -> None:

@@ -21,6 +21,8 @@ from irlcli.errors import StageFailed, UsageError, described, first_line
 
 # The largest that the description of a reward or a policy may hold.
 _LARGEST_OBSERVATION = 4096
+# Training computes in float32.
+_LARGEST_REWARD = float(np.finfo(np.float32).max)
 
 
 @contextmanager
@@ -70,8 +72,8 @@ class Adapted(gymnasium.Wrapper):
             reward = float(reward)
         except (Exception, SystemExit) as error:
             raise self._failed("step", error) from error
-        if not math.isfinite(reward):
-            raise self._wrong("step", f"returned the reward {reward}")
+        if not abs(reward) <= _LARGEST_REWARD:
+            raise self._wrong("step", f"returned the reward {reward}: it must be finite in float32")
         ends = self._flag("terminated", terminated), self._flag("truncated", truncated)
         return self._seen(observation, "step"), reward, *ends, self._reported(info)
 
@@ -109,7 +111,7 @@ class Adapted(gymnasium.Wrapper):
         return flat
 
     def _flag(self, name: str, value: Any) -> bool:
-        if np.size(value) != 1:
+        if np.size(value) != 1 or value not in (0, 1):
             raise self._wrong("step", f"returned a {name} that is not true or false")
         return bool(value)
 

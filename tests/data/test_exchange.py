@@ -200,6 +200,7 @@ def changed(column, row, value):
         (changed("next_obs", 6, [0.0, float("inf"), 0.0]), 6, "next_obs is not finite"),
         (changed("obs", 0, [1e300, 0.0, 0.0]), 0, "obs is not finite"),
         (changed("reward", 4, float("nan")), 4, "reward is not finite"),
+        (changed("reward", 4, -1e39), 4, "reward is not finite"),
         (changed("obs", 5, [0.0, 0.0]), 5, "obs has 2 numbers, but 3"),
         (changed("obs", 5, None), 5, "obs is missing"),
         (changed("obs", 5, [0.0, None, 0.0]), 5, "obs is missing"),

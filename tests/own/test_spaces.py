@@ -179,7 +179,11 @@ def test_an_environment_cannot_change_the_action_of_its_caller():
         (({"a": 1}, 0.0, False, False, {}), "an observation that is no array"),
         (([[1, 2], [3]], 0.0, False, False, {}), "an observation that is no array"),
         (([1], 0.0, [False, True], False, {}), "a terminated that is not true or false"),
+        (([1], 0.0, np.nan, False, {}), "a terminated that is not true or false"),
+        (([1], 0.0, False, "no", {}), "a truncated that is not true or false"),
         (([1], 0.0, False, [False, True], {}), "a truncated that is not true or false"),
+        (([1], np.inf, False, False, {}), "the reward inf"),
+        (([1], -1e39, False, False, {}), "the reward -1e+39"),
         (([1], 0.0, False, False, None), "an info that is no dictionary"),
         (([1], 0.0, False, False, {"progress": None}), "is not a finite number"),
         (([1], 0.0, False, False, {"progress": np.inf}), "is not a finite number"),
@@ -196,6 +200,17 @@ def test_what_a_step_returns_is_checked_at_once(returned, named):
     with pytest.raises(StageFailed, match=re.escape(named)) as caught:
         world.step(np.zeros(1))
     assert caught.value.message.startswith("odd: step() returned")
+
+
+@pytest.mark.parametrize("true", [True, 1, 1.0, np.True_, np.array([True])])
+def test_the_end_of_an_episode_is_true_or_false_in_any_type(true):
+    class Ending(Counter):
+        def step(self, action):
+            return [1], 0.0, true, np.logical_not(true), {}
+
+    world = Adapted(Ending(), "ending")
+    world.reset(seed=0)
+    assert world.step(np.zeros(1))[2:4] == (True, False)
 
 
 def test_an_environment_that_exits_is_named():
