@@ -140,7 +140,8 @@ def create(layout: Layout) -> None:
     try:
         make_directories(layout)
         # Created now: a user who may only read the store later cannot create it, but can lock it.
-        os.close(os.open(layout.gc_lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC))
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+        os.close(os.open(layout.gc_lock, flags, 0o666))
         _check_links(layout)
         write_durably(layout.marker, b'{"format": %d}\n' % FORMAT)
     except OSError as error:

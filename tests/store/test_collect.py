@@ -188,6 +188,9 @@ def test_locks_of_a_group_can_be_taken_by_its_members(tmp_path):
     try:
         with locked(tmp_path / "lock"):
             assert (tmp_path / "lock").stat().st_mode & 0o777 == 0o664
+        Store(tmp_path / "store").create()
+        for lock in (tmp_path / "store" / ".locks").iterdir():
+            assert lock.stat().st_mode & 0o777 == 0o664
     finally:
         os.umask(before)
 
