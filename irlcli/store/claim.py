@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import Busy
-from irlcli.store.durable import alive, machine, unique_name
+from irlcli.store.durable import alive, machine, remove, unique_name
 
 HEARTBEAT_SECONDS = 20.0
 # NFS clients may show times that are 60 s old, so a live claim can look 80 s old.
@@ -137,7 +137,7 @@ def live_reader(directory: Path, locks_work: bool) -> Holder | None:
         holder = read(path)
         if holder is not None and holder.lives(locks_work):
             return holder
-        path.unlink(missing_ok=True)
+        remove(path)
     return None
 
 
@@ -165,15 +165,14 @@ def _content(path: Path) -> tuple[_Said, float] | None:
     """What a claim says, and when it was touched [s]; None without a claim."""
     try:
         # Opened and not only looked up, so that a file system of the network asks its server.
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with open(path, "rb", opener=_open) as file:
+            touched = os.fstat(file.fileno()).st_mtime
+            text = file.read(1000)
     except FileNotFoundError:
         return None
     except OSError:
-        # A link, for example: no claim, and to be removed.
+        # A link or a directory, for example: no claim, and to be removed.
         return _Said(), 0.0
-    with open(descriptor, "rb") as file:
-        touched = os.fstat(descriptor).st_mtime
-        text = file.read(1000)
     try:
         said = json.loads(text)
         host, where, token = (str(said[field]) for field in ("host", "machine", "token"))
@@ -181,6 +180,10 @@ def _content(path: Path) -> tuple[_Said, float] | None:
     except (ValueError, KeyError, TypeError):
         # It is being written, or the disk was full.
         return _Said(), touched
+
+
+def _open(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def _now(directory: Path) -> float:
@@ -227,7 +230,7 @@ def _remove(path: Path, token: str) -> None:
         # Another process took it over first: give it back.
         with suppress(FileExistsError):
             os.link(aside, path)
-    aside.unlink(missing_ok=True)
+    remove(aside)
 
 
 class _Heart:

@@ -172,6 +172,15 @@ def test_a_link_is_no_claim(empty_store, claims, tmp_path):
     assert not os.path.lexists(claims / f"{KEY}.claim")
 
 
+def test_a_directory_is_no_claim(empty_store, claims):
+    for name in (f"{KEY}.claim", "gc.claim", ".reader.x"):
+        (claims / name).mkdir()
+    with empty_store.in_use():
+        work(empty_store)
+    empty_store.collect(0.0)
+    assert not [path for path in claims.iterdir() if path.is_dir()]
+
+
 def test_a_full_disk_stops_no_reader(empty_store, monkeypatch):
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device")
