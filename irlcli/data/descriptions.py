@@ -292,6 +292,12 @@ class Assessment(Struct, frozen=True, kw_only=True):
     bank: tuple[BankEntry, ...]
     epic_missing: str = ""
 
+    def __post_init__(self) -> None:
+        for s in self.settings:
+            kinds = {e.kind for e in self.bank if e.setting == s.setting}
+            if s.retrained and not {"expert", "random"} <= kinds:
+                raise ValueError(f"the bank has no expert or no random agent in {s.setting}")
+
     @property
     def weak_settings(self) -> list[str]:
         """Settings with verdicts that mean nothing: the expert earns no more than the random agent."""

@@ -14,6 +14,7 @@ import torch
 from chains import assert_refused, run_many
 
 from irlcli.data.demonstrations import EPISODES, STEPS, read_demonstrations
+from irlcli.data.descriptions import Assessment, convert
 from irlcli.data.tensors import (
     RefusedCode,
     from_bytes,
@@ -223,3 +224,18 @@ def test_numbers_that_are_not_finite_are_refused(smoke_store, tmp_path, kind, nu
     (tmp_path / "file.pt").write_bytes(to_bytes(data))
     with pytest.raises(IntegrityError, match=r"file\.pt.* not finite"):
         {"reward": load_reward_file, "policy": load_policy_file}[kind](tmp_path / "file.pt")
+
+
+def test_an_assessment_without_the_agents_that_its_verdicts_need():
+    number, none = {"mean": 1.0, "error": None}, {"policies": 1, "spearman": None, "pearson": None}
+    verdict = {"policy": "p", "true_regret": number, "learned_gap": number, "clear": True}
+    place = {"setting": "mass=1x", "overall": none, "lower_half": none}
+    document = {
+        "env": "ant",
+        "reward": {"method": "erm", "seed": 0, "settings": ["mass=1x"]},
+        "settings": [place | {"retrained": [verdict | {"verdict": "retrained"}]}],
+        "pooled": None,
+        "bank": [],
+    }
+    with pytest.raises(IntegrityError, match=r"a\.json.* no expert"):
+        convert(document, Assessment, "a.json")
