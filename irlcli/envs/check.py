@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -18,7 +17,7 @@ from irlcli.envs.registration import make
 from irlcli.envs.spec import EnvironmentSpec, Knob
 from irlcli.envs.symmetry import symmetries
 from irlcli.errors import IrlError, first_line
-from irlcli.interventions import Setting, Value, parse_value
+from irlcli.interventions import Setting, Value
 
 _MOST_STEPS = 200
 # Of every episode.
@@ -55,9 +54,6 @@ def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Ite
     for name, knob in spec.knobs.items():
         ends = [Setting(((name, value),)) for value in _ends(knob)]
         yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))
-        yield _outcome(
-            f"{name}: values out of bounds are refused", partial(_check_beyond, spec, name)
-        )
         settings = [Setting(), *listed.get(name, ()), *ends]
         yield _outcome(f"{name}: it changes episodes", partial(_check_moves, spec, name, settings))
 
@@ -136,20 +132,6 @@ def _check_symmetries(spec: EnvironmentSpec) -> None:
 def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting]) -> None:
     for setting in ends:
         _make(spec, setting)
-
-
-def _check_beyond(spec: EnvironmentSpec, name: str) -> None:
-    knob = spec.knobs[name]
-    for end in _ends(knob):
-        numbers = [
-            math.nextafter(x, math.inf if x == knob.high else -math.inf) for x in end.numbers
-        ]
-        text = str(Value(end.form, tuple(numbers)))
-        try:
-            parse_value(spec.name, name, text)
-        except IrlError:
-            continue
-        raise _Wrong(f"{name}={text} was accepted")
 
 
 def _check_moves(spec: EnvironmentSpec, name: str, settings: Sequence[Setting]) -> None:
