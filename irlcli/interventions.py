@@ -9,7 +9,6 @@ Grammar, per comma-separated value: ``2x`` multiplies the default, ``0.5`` is ab
 several knobs: ``friction=0.5,mass=2x``.
 """
 
-import math
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -145,7 +144,7 @@ def knob_of(env: str, knob: str) -> Knob:
 def examples_of(knob: Knob) -> str:
     """A value in each form that ``knob`` allows: ``2x or 0.5``."""
     if knob.whole:
-        return _format(next(x for x in (knob.high, knob.low, 1.0) if math.isfinite(x)))
+        return _format(knob.high)
     return " or ".join(_EXAMPLES[form] for form in knob.forms)
 
 
@@ -193,7 +192,7 @@ def parse_value(env: str, knob: str, text: str) -> Value:
                 f"{knob} ({spec.description}) {_allowed(spec)}",
             )
         for x in numbers:
-            if not math.isfinite(x) or not spec.low <= x <= spec.high:
+            if not spec.low <= x <= spec.high:
                 raise UsageError(
                     f"{knob}={text.strip()!r} is out of range",
                     f"{knob} ({spec.description}) {_allowed(spec)}",

@@ -26,7 +26,7 @@ class Knob(NamedTuple):
     Attributes:
         argument: keyword argument of the environment that takes the value.
         forms: allowed forms of a value; the usual form comes first.
-        low, high: inclusive bounds of every number in a value.
+        low, high: finite, inclusive bounds of every number in a value.
         description: short noun phrase for messages.
         whole: whether only whole numbers are allowed.
         observed: what the knob adds to the observation, as in "a goal"; empty if nothing.

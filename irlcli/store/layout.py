@@ -14,6 +14,7 @@
 import errno
 import os
 import re
+import shlex
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,6 +51,11 @@ class Layout(NamedTuple):
         """The words that name this store on a command line; none if it is the default."""
         default = Path(os.environ.get("IRL_STORE") or DEFAULT_ROOT)
         return [] if self.root == default else ["--store", str(self.root)]
+
+    @property
+    def listing(self) -> str:
+        """The command that lists the artefacts, as the end of a hint."""
+        return f"`{shlex.join(['irl', 'ls', *self.option])}` lists the artefacts"
 
     @property
     def marker(self) -> Path:

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -87,7 +86,7 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     head = text.partition("/")[0]
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
-    listing = f"`{shlex.join(['irl', 'ls', *layout.option])}` lists the artefacts"
+    listing = layout.listing
     close = closest(head, names(layout))
     if close is not None:
         listing = f"did you mean {close!r}? {listing}"
@@ -156,21 +155,20 @@ def _by_prefix(layout: Layout, prefix: str) -> Artefact | None:
 
 def names(layout: Layout) -> dict[str, str]:
     """Name to id, sorted by name."""
-    try:
-        entries = sorted(path.name for path in layout.names.iterdir())
-    except FileNotFoundError:
-        return {}
-    found = {name: named(layout, name) for name in entries}
+    found = {name: named(layout, name) for name in _pointers(layout)}
     return {name: id16 for name, id16 in found.items() if id16 is not None}
 
 
 def damaged_names(layout: Layout) -> list[str]:
     """The names whose file does not contain an id."""
+    return [name for name in _pointers(layout) if named(layout, name) is None]
+
+
+def _pointers(layout: Layout) -> list[str]:
     try:
-        entries = sorted(path.name for path in layout.names.iterdir())
+        return sorted(path.name for path in layout.names.iterdir() if is_name(path.name))
     except FileNotFoundError:
         return []
-    return [name for name in entries if is_name(name) and named(layout, name) is None]
 
 
 def named(layout: Layout, name: str) -> str | None:

@@ -100,9 +100,7 @@ class Store:
     @property
     def listing(self) -> str:
         """The command that lists the artefacts, as the end of a hint."""
-        import shlex
-
-        return f"`{shlex.join(['irl', 'ls', *self.option])}` lists the artefacts"
+        return self._layout.listing
 
     # Reading
 
