@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
+from irlcli.envs.arguments import clipped, is_finite
 from irlcli.envs.bullet.body import Vector
 from irlcli.envs.bullet.robot import Robot
 from irlcli.envs.bullet.world import TIME_STEP, World, has_display
-from irlcli.envs.checks import clipped, is_finite
 
 _NOT_FINITE = "the state of the world is not finite"
 

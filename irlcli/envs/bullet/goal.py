@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from irlcli.envs.checks import require
+from irlcli.envs.arguments import require
 
 GOAL_DISTANCE = 1000.0
 

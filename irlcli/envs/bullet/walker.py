@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from irlcli.envs.arguments import require
+from irlcli.envs.bullet.arguments import require_friction, require_model
 from irlcli.envs.bullet.body import Link, Vector, create_body
-from irlcli.envs.bullet.checks import require_friction, require_model
 from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.goal import Goal
 from irlcli.envs.bullet.mjcf import load_bodies, moving_joints
 from irlcli.envs.bullet.robot import Robot
-from irlcli.envs.checks import require
 
 Morphology = Callable[[float], tuple[Link, list[Link]]]
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.envs.box2d import lunar_lander as original
 from gymnasium.utils import EzPickle
 
-from irlcli.envs.checks import require
+from irlcli.envs.arguments import require
 
 
 def _bind(function: Callable[..., Any], **constants: float) -> types.FunctionType:

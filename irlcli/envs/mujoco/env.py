@@ -20,7 +20,7 @@ from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
 from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
-from irlcli.envs.checks import clipped, is_finite, require
+from irlcli.envs.arguments import clipped, is_finite, require
 from irlcli.envs.mujoco.model import Changes, intervened
 from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
 from irlcli.errors import StageFailed, first_line

@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+from irlcli.envs.arguments import require
+from irlcli.envs.bullet.arguments import require_model
 from irlcli.envs.bullet.body import (
     FROM_TO_MARGIN,
     Capsule,
@@ -19,13 +21,11 @@ from irlcli.envs.bullet.body import (
     create_body,
     single,
 )
-from irlcli.envs.bullet.checks import require_model
 from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.episode import RobotEnv
 from irlcli.envs.bullet.mjcf import load_bodies
 from irlcli.envs.bullet.robot import Robot
 from irlcli.envs.bullet.world import GRAVITY, TIME_STEP, World
-from irlcli.envs.checks import require
 
 _RADIUS = single(0.01)
 _BALL_RADIUS = 0.01

@@ -1,4 +1,4 @@
-"""Checks of the numbers that the robot environments take."""
+"""Ranges and shapes of the numbers that the robot environments take."""
 
 from __future__ import annotations
 

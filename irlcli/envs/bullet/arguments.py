@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from irlcli.envs.arguments import require
 from irlcli.envs.bullet.body import single
-from irlcli.envs.checks import require
 
 Friction = tuple[float, float, float]
 Model = Literal["merged", "original"]
