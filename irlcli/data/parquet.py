@@ -23,8 +23,8 @@ def writer(
 ) -> pq.ParquetWriter:
     """A writer of ``path`` with zstd compression and page checksums.
 
-    Columns other than ``repeating`` are written without a dictionary: to try one for recorded
-    numbers, which do not repeat, costs more than all the rest. None: Arrow tries every column.
+    Columns other than ``repeating`` are written without a dictionary: building one for recorded
+    numbers, which rarely repeat, takes longer than everything else. None: Arrow tries every column.
     """
     return pq.ParquetWriter(
         path,

@@ -31,8 +31,8 @@ _MAX_NUMBER = 1e300
 # Version of how such environments are stepped (irlcli.envs.adapted, irlcli.rl.rollout); part of
 # every key.
 _PHYSICS = 2
-# What the column ``t`` of demonstrations holds.
 _EXAMPLES = "docs/own-environments.md"
+# The column ``t`` of demonstrations is int32.
 _Steps = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 _Number = Annotated[float, Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 

@@ -124,11 +124,12 @@ class EnvironmentSpec(NamedTuple):
             and rewards from ``train-maxent``.
         physics: version of the dynamics and the true reward. It is part of every key: increase
             it with each change that alters trajectories.
-        transition_reward: ``module:function`` of the true reward [B] as a function of
-            observations, actions and next observations, where it is one; else None.
+        transition_reward: ``module:function`` that computes the true reward [B] from observations,
+            actions and next observations; None if they do not determine it.
         symmetries: ``module:function`` of :class:`irlcli.symmetries.Symmetries` as a function of the
             keyword arguments of settings, where there are any; else None.
-        unobserved: what the true reward depends on besides them, as the end of a sentence, if known.
+        unobserved: what else the true reward depends on, besides observations and actions, worded
+            as the end of a sentence; None if unknown.
         needs: a library that may be missing.
         own: of an environment from outside the package; its ``entry_point`` or ``gym_id`` is empty.
     """

@@ -78,8 +78,8 @@ def _file_problems(artefact: Artefact, quick: bool) -> list[str]:
 def verify(layout: Layout, ids: Iterable[str], quick: bool) -> tuple[dict[str, Damage], Index]:
     """Check artefacts and move the damaged ones to quarantine.
 
-    Returns the damaged ones, and what the sound ones were made from. Artefacts of a newer schema
-    are in both (``newer``); they are not moved.
+    Returns the damaged artefacts by id, and the index of the others. Artefacts of a newer schema
+    are in both and are not moved.
     """
     found: dict[str, Damage] = {}
     sound, unknown = {}, {}

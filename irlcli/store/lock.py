@@ -1,7 +1,7 @@
 """Advisory file locks (flock). They only avoid duplicate work; publishing is safe without them.
 
-They hold between the processes of one machine. What must hold between machines, and where the file
-system has no locks, is left to :mod:`irlcli.store.claim`.
+They hold between the processes of one machine. Between machines, and on file systems without
+locks, claims do this (:mod:`irlcli.store.claim`).
 """
 
 from __future__ import annotations

@@ -53,6 +53,8 @@ def share(
     Args:
         warn: receives what is missing of the lineage.
         start: receives the number of artefacts and bytes to copy; returns what counts the bytes.
+        partial: skip, with a warning, artefacts that were made from a damaged one, instead of
+            raising.
 
     Raises:
         IntegrityError: a file is damaged in ``source``. Its artefact does not appear in

@@ -67,7 +67,7 @@ class Expected:
         )
 
     def contradicts(self, name: Any, place: str) -> None:
-        """Refuse a source of the one setting that names another one in ``setting`` all the same.
+        """Refuse a source whose ``setting`` column names another setting than the only one expected.
 
         Only the whole text of a setting counts: ``setting`` may mean anything in a foreign source.
 
