@@ -159,7 +159,9 @@ def test_what_is_no_end_of_an_episode_is_named(tmp_path, terminal, message):
         imported(read_imitation, tmp_path / "a", tmp_path / "out", cut=True)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "text", "outside", "none", "stateless"])
+@pytest.mark.parametrize(
+    "damage", ["truncated", "text", "outside", "none", "stateless", "selected"]
+)
 def test_a_damaged_directory_of_imitation_is_refused(tmp_path, damage):
     rng = np.random.default_rng(0)
     source = tmp_path / "a"
@@ -176,6 +178,9 @@ def test_a_damaged_directory_of_imitation_is_refused(tmp_path, damage):
             state.write_text(json.dumps({"_data_files": []}))
         case "stateless":
             state.unlink()
+        case "selected":
+            # As datasets saves what select() and shuffle() return.
+            (source / "indices-00000-of-00001.arrow").touch()
     with pytest.raises(IntegrityError):
         imported(read_imitation, source, tmp_path / "out")
 

@@ -96,6 +96,15 @@ def test_bounce_is_restitution():
     assert speeds[2] - speeds[0] > 0.5
 
 
+def test_hull_and_legs_bounce_in_every_episode():
+    env = LunarLander(bounce=0.5)
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        fixtures = [fixture for body in (env.lander, *env.legs) for fixture in body.fixtures]
+        assert len(fixtures) == 3
+        assert {fixture.restitution for fixture in fixtures} == {0.5}
+
+
 def sliding_distance(friction):
     """Distance [m] that the lander slides along the pad in 0.8 s from 3 m/s."""
     env = LunarLander(friction=friction)
