@@ -12,6 +12,8 @@ Every function takes *points*, a row per evaluation and setting with the columns
     true_return, progress, learned_return
                   means over episodes; progress may be missing. The learned return is under the
                   ceiling of the retrained policy, and of it and of the expert by its reward only
+    true_error, learned_error
+                  standard errors of those means; missing where the learned return is
     episodes      their number
     evaluation    id of the artefact
 """
@@ -26,11 +28,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from irlcli.data.descriptions import Assessment, Interval, Measured, Verdict
+from irlcli.data.descriptions import Assessment, Interval, Measured
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, comparisons
 from irlcli.report.lineage import evaluations, is_mixed, origins
 from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
-from irlcli.report.reward_quality import judge
+from irlcli.report.reward_quality import Judgement, difference, judge
 from irlcli.report.statistics import compare, holm, paired_p, summarise
 
 # A student imitates if its return is within a fifth of its expert's.
@@ -44,6 +46,8 @@ _DIAGNOSTICS = (
     "optimised_penalty",
     "penalty_weight",
 )
+
+_SCORED = ["true_return", "true_error", "learned_return", "learned_error"]
 
 Learning = Mapping[tuple[str, str, int], pd.DataFrame]
 Assessments = Mapping[tuple[str, str, int | None], Assessment]
@@ -246,9 +250,18 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     ``retrained`` and ``expert``, mean learned returns of the retrained policies and of the held-out
     setting's expert; ``short``, the policies that fall short of the expert, and
     ``short_scored_higher``, those of them because of a wrong reward: see
-    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return.
+    :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return;
+    ``uncertain``, the verdicts that rest on differences within two standard errors.
     """
-    counted = ["seeds", "judged", "retrained", "expert", "short", "short_scored_higher"]
+    counted = [
+        "seeds",
+        "judged",
+        "retrained",
+        "expert",
+        "short",
+        "short_scored_higher",
+        "uncertain",
+    ]
     columns = ["row", "agent", *counted]
     found = []
     for row in p.rows if "transfer" in p.measures else ():
@@ -258,16 +271,21 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                 points_of(points, row.name, method, m).dropna(subset="learned_return")
                 for m in ("transfer", EXPERT_BY_REWARD)
             )
-            policies = policies[["seed", "true_return", "learned_return"]]
+            policies = policies[["seed", *_SCORED]]
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
                 continue
-            verdicts = [
-                _verdict(r, random) for r in both.itertuples() if r.true_return_expert > random
+            judged = [
+                _judged(r, random) for r in both.itertuples() if r.true_return_expert > random
             ]
+            verdicts = [judgement.verdict for judgement in judged]
             scores = both[["learned_return", "learned_return_expert"]]
             means = map(float, scores.groupby(both["seed"]).mean().mean())
-            counts = len(verdicts) - verdicts.count("retrained"), verdicts.count("wrong reward")
+            counts = (
+                len(verdicts) - verdicts.count("retrained"),
+                verdicts.count("wrong reward"),
+                sum(not judgement.clear for judgement in judged),
+            )
             seeds = both["seed"].nunique()
             found.append((row.name, method, seeds, len(verdicts), *means, *counts))
     return pd.DataFrame(found, columns=columns)
@@ -311,18 +329,21 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
     return pd.DataFrame(found, columns=[*columns, "return_distance", "verdicts", "uncertain"])
 
 
-def _verdict(seed: Any, random: float) -> Verdict:
-    """On a seed's retrained policy. Points hold means only, so no standard errors are known."""
-    earned, best, worst, gap = (
-        Measured(mean=float(value), error=None)
-        for value in (
-            seed.true_return,
-            seed.true_return_expert,
-            random,
-            seed.learned_return_expert - seed.learned_return,
-        )
+def _judged(pair: Any, random: float) -> Judgement:
+    """The verdict on a retrained policy, beside the expert under the same reward."""
+
+    def known(mean: float, error: float) -> Measured:
+        return Measured(mean=float(mean), error=None if pd.isna(error) else float(error))
+
+    return judge(
+        known(pair.true_return, pair.true_error),
+        known(pair.true_return_expert, pair.true_error_expert),
+        Measured(mean=random, error=None),
+        difference(
+            known(pair.learned_return_expert, pair.learned_error_expert),
+            known(pair.learned_return, pair.learned_error),
+        ),
     )
-    return judge(earned, best, worst, gap).verdict
 
 
 def discriminator_ends(p: Parameters, learning: Learning) -> pd.DataFrame:

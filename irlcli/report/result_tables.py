@@ -44,7 +44,8 @@ _LEARNED_NOTE = (
     "setting's expert. Short: policies with a regret of more than 10 % of what the "
     "expert earns above the random agent; - beside an expert no better than the random agent. Scored higher: those of them that the reward scores at least "
     "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
-    "show that the reward is right. Both are scored under the transfer.ceiling that the policy was "
+    "show that the reward is right. Uncertain: verdicts on differences within two standard errors of the "
+    "episodes. Both are scored under the transfer.ceiling that the policy was "
     "trained under, if any. The unit is the standard deviation of g on the training data; zero has no "
     "meaning."
 )
@@ -229,10 +230,12 @@ def learned_returns(found: pd.DataFrame) -> Table:
             number(r.expert),
             f"{r.short}/{r.judged}" if r.judged else "-",
             f"{r.short_scored_higher}/{r.short}" if r.short else "",
+            str(r.uncertain) if r.judged else "",
         ]
         for r in found.itertuples()
     ]
     columns = ["row", "method", "seeds", "retrained policy", "expert", "short", "scored higher"]
+    columns.append("uncertain")
     return Table("Learned returns", _LEARNED_NOTE, columns, lines, heads=2)
 
 

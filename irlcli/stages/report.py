@@ -7,6 +7,7 @@ how long, at which commit) are parameters, so that equal requests give equal byt
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, Parameters
@@ -71,6 +72,7 @@ def _points(job: Job) -> list[dict[str, Any]]:
         summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         scored = cell.measure in ("transfer", EXPERT_BY_REWARD)
         of_expert = cell.agent in ("expert", "reused") or cell.measure == EXPERT_BY_REWARD
+        errors = _errors(job.inputs[cell.role] / "episodes.parquet") if scored else {}
         points += [
             {
                 "row": cell.row,
@@ -83,12 +85,23 @@ def _points(job: Job) -> list[dict[str, Any]]:
                 "true_return": place.mean_return,
                 "progress": place.mean_progress,
                 "learned_return": place.mean_learned_return if scored else None,
+                "true_error": errors.get((place.setting, "true_return")),
+                "learned_error": errors.get((place.setting, "learned_return")),
                 "episodes": place.episodes,
                 "evaluation": cell.run,
             }
             for place in summary.settings
         ]
     return points
+
+
+def _errors(path: Path) -> dict[tuple[str, str], float]:
+    """Standard errors of the mean returns in an evaluation's ``episodes.parquet``, by setting and kind."""
+    import pandas as pd
+
+    frame = pd.read_parquet(path)
+    kinds = [kind for kind in ("true_return", "learned_return") if kind in frame]
+    return frame.groupby("setting")[kinds].sem().stack().to_dict()
 
 
 def _episodes(job: Job) -> caveats.Episodes:
@@ -165,4 +178,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 24, run)
+STAGE = Stage("report", 25, run)

@@ -100,6 +100,7 @@ def test_learned_returns_rank_policy_and_expert():
         {
             **{"row": BOUNCE, "agent": agent, "seeds": 3, "judged": 3},
             **{"retrained": policy, "expert": expert, "short": 3, "short_scored_higher": higher},
+            "uncertain": 3,
         }
         for agent, policy, expert, higher in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 1))
     ]
@@ -136,6 +137,21 @@ def test_beside_an_expert_no_better_than_random_none_is_judged():
     (table,) = (t for t in report.tables if t.title == "Learned returns")
     assert dict(zip(table.columns, table.rows[0], strict=True))["short"] == "-"
     assert not any(c.startswith("Short of") for c in report.caveats)
+
+
+@pytest.mark.parametrize(("error", "uncertain"), [(None, 3), (3.0, 0), (4.0, 1), (20.0, 2)])
+def test_verdicts_within_two_standard_errors_are_uncertain(error, uncertain):
+    """Learned returns of the expert are higher by 10, 20 and 100; the error of each is sqrt(2) times its own."""
+    values = complete() | {(BOUNCE, "erm", EXPERT_BY_REWARD): [250.0] * 3}
+    p, points = example(values)
+    mine = (
+        (points["measure"] == "transfer") & (points["agent"] == "erm") & (points["row"] == BOUNCE)
+    )
+    points.loc[mine, "learned_return"] = [90.0, 80.0, 0.0]
+    points.loc[points["measure"] == EXPERT_BY_REWARD, "learned_return"] = 100.0
+    points[["true_error", "learned_error"]] = error
+    (found,) = build(p, points, {}, {}).learned_returns.itertuples()
+    assert (found.short, found.uncertain) == (3, uncertain)
 
 
 def test_every_retrained_policy_of_a_reward_is_judged():
