@@ -134,6 +134,23 @@ def test_gc_keeps_the_scratch_of_a_live_claim(empty_store, claims):
     assert list(claims.glob(f"{KEY}*")) == []
 
 
+def test_a_claim_that_another_process_took_over_first_is_given_back(
+    empty_store, claims, monkeypatch
+):
+    path = foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS + 1)
+    rename = os.rename
+
+    def late(source, target):
+        if source == path:
+            foreign(path).write_text(path.read_text().replace('"t"', '"new"'))
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", late)
+    with pytest.raises(Busy, match="another-node"):
+        work(empty_store)
+    assert claim.read(path).token == "new"
+
+
 @pytest.fixture
 def no_locks(monkeypatch):
     """A file system without flock."""

@@ -210,9 +210,15 @@ def test_a_name_and_a_checkpoint_are_durable_when_written(tmp_path):
     artefact = attempt(store).artefact
     with store.working_on(RECORD.key, wait=False) as scratch, recorded() as log:
         store.set_name("best", artefact)
+        store.claim_name("pulled", artefact)
         scratch.save(b"state")
-    for path in (store.root / ".names" / "best", scratch.directory / "checkpoint"):
-        appears = log.index(("replace", str(path)))
+    names = store.root / ".names"
+    for call, path in (
+        ("replace", names / "best"),
+        ("link", names / "pulled"),
+        ("replace", scratch.directory / "checkpoint"),
+    ):
+        appears = log.index((call, str(path)))
         # The content before, the name after.
         assert any(
             call == "fsync" and Path(p).name.startswith(f".{path.name}.")

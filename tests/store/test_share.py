@@ -16,6 +16,7 @@ from irlcli.experiments.status import Lookup
 from irlcli.stages.base import Request, Stage
 from irlcli.store import Store
 from irlcli.store.remote import Remote
+from irlcli.store.sources import open_place
 
 
 def test_a_colleague_gets_the_artefact_its_lineage_and_names(irl, store, chain, place, tmp_path):
@@ -119,6 +120,31 @@ def test_a_file_of_what_was_found_behind_a_url(store, publish, url, tmp_path):
     assert lookup.file(request, "choice.json").read_bytes() == b"{}"
     assert Lookup(store).file(request, "choice.json") == made.directory / "choice.json"
     assert Lookup(other(tmp_path)).file(request, "choice.json") is None
+
+
+def test_an_ancestor_that_the_provenance_does_not_lead_to_is_found_by_content(
+    empty_store, publish, url, tmp_path
+):
+    expert, stranger = (
+        publish(empty_store, {"f": name}, parameters={"of": name.decode()}).artefact
+        for name in (b"expert", b"stranger")
+    )
+    demos = publish(
+        empty_store,
+        inputs={"expert": expert.output("f").sha256},
+        places={"expert": f"{stranger.id}/f"},
+    ).artefact
+    push(empty_store, url, demos, stranger)
+    pulled = pull(url, other(tmp_path), demos.id)
+    assert [a.id for a in pulled.copied] == [expert.id, demos.id]
+
+
+def test_a_file_url_is_a_store_on_disk(store, chain, tmp_path):
+    url = f"file://{tmp_path}/there"
+    assert isinstance(open_place(url, pytest.fail), Store)
+    push(store, url, chain["airl"])
+    there = Store(tmp_path / "there", pytest.fail)
+    assert there.ids() == store.ids() and not there.verify(there.ids())
 
 
 # Interruptions
