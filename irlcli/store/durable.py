@@ -27,24 +27,25 @@ def fsync_directory(path: Path | str) -> None:
         os.close(descriptor)
 
 
-def write_durably(path: Path, data: bytes) -> None:
-    """Replace the content of ``path`` with ``data``, atomically.
+def write_durably(path: Path, *data: bytes) -> None:
+    """Replace the content of ``path`` with all ``data``, one after the other, atomically.
 
     Raises:
         OSError: the disk is full or the directory not writable; ``path`` is unchanged.
     """
-    with temporary_file(path, data) as temporary:
+    with temporary_file(path, *data) as temporary:
         os.replace(temporary, path)
     fsync_directory(path.parent)
 
 
 @contextmanager
-def temporary_file(path: Path, data: bytes) -> Iterator[Path]:
-    """A durable file beside ``path`` that contains ``data`` and is removed afterwards."""
+def temporary_file(path: Path, *data: bytes) -> Iterator[Path]:
+    """A durable file beside ``path`` that contains all ``data`` and is removed afterwards."""
     temporary = path.with_name(unique_name(f".{path.name}"))
     try:
         with open(temporary, "wb") as file:
-            file.write(data)
+            for part in data:
+                file.write(part)
             file.flush()
             os.fsync(file.fileno())
         yield temporary

@@ -24,7 +24,8 @@ class Scratch:
     def save(self, data: bytes) -> None:
         """Replace the checkpoint with ``data``."""
         self.directory.mkdir(exist_ok=True)
-        write_durably(self.directory / CHECKPOINT, hashlib.sha256(data).digest() + data)
+        # In two parts: one would be a copy of the data in memory.
+        write_durably(self.directory / CHECKPOINT, hashlib.sha256(data).digest(), data)
 
     def load(self) -> bytes | None:
         """The data of the checkpoint; None without one.
@@ -39,10 +40,12 @@ class Scratch:
             return None
         if not stat.S_ISREG(information.st_mode) or information.st_size > _MAX_BYTES:
             raise ValueError(f"{path} is not a checkpoint")
-        stored = path.read_bytes()
-        if hashlib.sha256(stored[32:]).digest() != stored[:32]:
+        # Unbuffered: the buffer would be joined with the rest, which copies it.
+        with open(path, "rb", buffering=0) as file:
+            digest, data = file.read(32), file.read()
+        if hashlib.sha256(data).digest() != digest:
             raise ValueError(f"{path} is damaged")
-        return stored[32:]
+        return data
 
     def discard_checkpoint(self) -> None:
         """Remove the checkpoint, so that the stage starts over."""

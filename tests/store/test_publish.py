@@ -8,6 +8,7 @@ import errno
 import os
 import signal
 import stat
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -225,6 +226,20 @@ def test_a_name_and_a_checkpoint_are_durable_when_written(tmp_path):
             for call, p in log[:appears]
         )
         assert ("fsync", str(path.parent)) in log[appears:]
+
+
+def test_a_checkpoint_is_in_memory_once(tmp_path):
+    """SAC's may be larger than half of the memory."""
+    store, data = Store(_created(tmp_path / "runs")), bytes(4 << 20)
+    with store.working_on(RECORD.key, wait=False) as scratch:
+        tracemalloc.start()
+        try:
+            scratch.save(data)
+            assert tracemalloc.get_traced_memory()[1] < len(data) / 2
+            assert scratch.load() == data
+            assert tracemalloc.get_traced_memory()[1] < 1.5 * len(data)
+        finally:
+            tracemalloc.stop()
 
 
 def test_published_files_are_read_only_and_scratch_is_gone(tmp_path):
