@@ -36,8 +36,6 @@ LISTED   = $(subst $(eval) ,$(COMMA),$(strip $(ROWS)))
 dashed   = $(subst /,-,$(subst $(eval) ,-,$(sort $(subst $(COMMA), ,$(1)))))
 PART     = $(addprefix -,$(call dashed,$(ROWS)))$(addprefix -,$(call dashed,$(METHODS)))$(addprefix -seeds-,$(call dashed,$(SEEDS)))
 RESULTS ?= results/$(or $(TAG),$(PROFILE))/$@$(PART)
-# What the demo's names begin with, as irl chooses it.
-DEMO     = $(or $(TAG),demo$(addprefix -,$(filter-out standard,$(PROFILE))))
 
 IRL     := $(VENV)/bin/irl
 READY   := $(VENV)/.installed
@@ -77,8 +75,6 @@ lint: $(READY)
 demo: $(READY)
 	$(IRL) run demo $(OPTIONS) --out $(RESULTS)
 	@echo; echo "report: $(RESULTS)/README.md and $(RESULTS)/demo.html"
-	@$(if $(SEEDS)$(METHODS),,echo; echo "what the retrained policy of AIRL-IRM was made from:"; \
-	    $(IRL) lineage --store $(STORE) $(DEMO).lunar-lander.engine-power.irm.0.transfer)
 
 all-results: experts table1 figure2 figure3 figure4 table2
 

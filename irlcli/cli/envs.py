@@ -43,7 +43,7 @@ def envs(
 
     list: built-in ones, and those that installed packages announce. show ENV: its knobs, settings and
     code. check ENV: gymnasium's check_env; equal seeds give equal episodes; every knob changes
-    something and can be made at its bounds.
+    something and can be made at its bounds, and 1x changes nothing.
     """
     if action not in _ACTIONS:
         raise UsageError(f"unknown action {action!r}", suggest(action, _ACTIONS))

@@ -33,7 +33,7 @@ def train_airl(
     method: Annotated[
         str | None,
         typer.Option(
-            help=f"One of: {', '.join(name for name, _ in complete.methods())}.",
+            help=f"One of: {', '.join(name for name, _ in complete.methods())}. Default: erm.",
             autocompletion=complete.methods,
         ),
     ] = None,
@@ -90,7 +90,7 @@ def train_maxent(
     method: Annotated[
         str | None,
         typer.Option(
-            help=f"One of: {', '.join(name for name, _ in complete.maxent_methods())}.",
+            help=f"One of: {', '.join(name for name, _ in complete.maxent_methods())}. Default: erm.",
             autocompletion=complete.maxent_methods,
         ),
     ] = None,

@@ -54,6 +54,8 @@ def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Ite
     for name, knob in spec.knobs.items():
         ends = [Setting(((name, value),)) for value in _ends(knob)]
         yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))
+        if "multiplier" in knob.forms and knob.low <= 1 <= knob.high:
+            yield _outcome(f"{name}: 1x is the default", partial(_check_one, spec, name))
         settings = [Setting(), *listed.get(name, ()), *ends]
         yield _outcome(f"{name}: it changes episodes", partial(_check_moves, spec, name, settings))
 
@@ -132,6 +134,16 @@ def _check_symmetries(spec: EnvironmentSpec) -> None:
 def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting]) -> None:
     for setting in ends:
         _make(spec, setting)
+
+
+def _check_one(spec: EnvironmentSpec, name: str) -> None:
+    if not _equal(
+        _make(spec, Setting()), _make(spec, Setting(((name, Value("multiplier", (1.0,))),)))
+    ):
+        raise _Wrong(
+            "its episodes differ from those without it, with equal seeds and actions: let the constructor "
+            "multiply, with a default of 1, or use absolute values"
+        )
 
 
 def _check_moves(spec: EnvironmentSpec, name: str, settings: Sequence[Setting]) -> None:

@@ -32,13 +32,15 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
         tested = comparisons[(comparisons["row"] == row.name) & (comparisons["measure"] == measure)]
         first = next(tested[tested["difference"].notna()].itertuples(), None)
         methods = p.methods if first is None else (first.y, first.x)
-        shown = [means[agent] for agent in (*methods, "expert", "reused") if agent in means]
+        others = ("expert", "reused", "random")
+        shown = [means[agent] for agent in (*methods, *others) if agent in means]
         if not any(method in means for method in methods):
             continue
         verdict = "" if first is None else f" {_verdict(first)}"
-        lines.append(
-            f"{row.name}, {MEASURES[measure].partition(':')[0]}: {'; '.join(shown)}.{verdict}"
-        )
+        settings = row.trained if measure in IN_DISTRIBUTION else (row.unseen,)
+        where = ", ".join(text.partition("=")[2] for text in settings)
+        what = MEASURES[measure].partition(":")[0].lower()
+        lines.append(f"{row.name} = {where}, {what}, true return: {'; '.join(shown)}.{verdict}")
     return lines
 
 

@@ -602,8 +602,6 @@ def test_make_passes_its_variables_on():
     assert report.endswith("--out results/standard/table1")
     part = commands("report-table1", "ROWS=ant", "METHODS=irm,erm", "SEEDS=1 0")[0]
     assert part.endswith("--out results/standard/table1-ant-erm-irm-seeds-0-1")
-    assert " demo-smoke.lunar-lander." in commands("demo", "PROFILE=smoke")[-1]
-    assert len(commands("demo")) == 2 and len(commands("demo", "SEEDS=1")) == 1
 
 
 def test_what_another_store_holds_is_not_called_missing(irl, table_store, tmp_path):
