@@ -303,7 +303,7 @@ def test_the_example_passes_every_check(bench):
     ("old", "new", "failed", "named"),
     [
         ("/ self.mass", "", "mass: it changes episodes", "are equal"),
-        ("mass_scale=1.0", "mass_scale=5.0", "mass: 1x is the default", "a default of 1"),
+        ("_scale=1.0, drag", "_scale=5.0, drag", "mass: 1x is the default", "a default of 1"),
         ("reset(seed=seed)", "reset()", "gymnasium's check_env", "seed"),
         (
             "self.np_random.uniform(-1.0, 1.0)",
