@@ -82,7 +82,8 @@ def print_assessment(assessment: Assessment) -> None:
         for row, text in zip(rows, progress, strict=True):
             row.insert(3, text)
     out.print_table(columns, rows, stderr=True)
-    columns = ["setting", "policies", "Spearman", "Pearson", "lower half", "Spearman", "Pearson"]
+    ranked = ["policies", "Spearman", "Pearson"]
+    columns = ["setting", *ranked, *(f"{name}, lower half" for name in ranked)]
     columns += ["expert - idle", "return distance", "EPIC"]
     every = [*assessment.settings, *([assessment.pooled] if assessment.pooled else [])]
     out.print_table(columns, [_ranked(s) for s in every], stderr=True)
