@@ -1,0 +1,49 @@
+"""IRM minus ERM in published reports, from their ``seeds.csv``: interval and detectable difference.
+
+For reports that were written before these columns existed. Also the mean over all methods, seed by
+seed, of what retraining earns above the student (t-test). Run with
+``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pandas as pd
+
+from irlcli.methods import METHODS
+from irlcli.report.statistics import compare, paired_p
+
+
+def main(reports: list[Path]) -> None:
+    """Print a line for each row and measure, and one for retraining."""
+    for report in reports:
+        seeds = pd.read_csv(report / "seeds.csv")
+        learned = seeds[seeds["agent"].isin([*METHODS])]
+        for (row, measure), points in learned.groupby(["row", "measure"], sort=False):
+            by_seed = points.groupby(["agent", "seed"])["true_return"].mean()
+            if {"irm", "erm"} <= {*by_seed.index.get_level_values("agent")}:
+                found = compare(by_seed["irm"].tolist(), by_seed["erm"].tolist())
+                if found.interval is not None:
+                    low, high = found.interval
+                    print(
+                        f"{report.name}: {row}, {measure}: IRM - ERM {found.difference:.1f} "
+                        f"[{low:.1f}, {high:.1f}], detectable {found.detectable:.1f}, p {found.welch:.3f}"
+                    )
+        for row, points in learned.groupby("row", sort=False):
+            means = points.pivot_table("true_return", "seed", "measure")
+            if {"transfer", "zero-shot"} <= {*means}:
+                both = means[["transfer", "zero-shot"]].dropna()
+                p = paired_p(both["transfer"].tolist(), both["zero-shot"].tolist())
+                gain = (both["transfer"] - both["zero-shot"]).mean()
+                shown = "-" if p is None else f"{p:.3f}"
+                print(
+                    f"{report.name}: {row}, all methods: transfer - zero-shot {gain:.1f}, p {shown}"
+                )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("report", nargs="+", type=Path, help="directory with a seeds.csv")
+    main(parser.parse_args().report)
