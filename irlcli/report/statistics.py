@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize, stats
 
 _RESAMPLES = 10_000
-# Of detectable differences.
+# The level of tests, and the power with which a detectable difference would be found.
 LEVEL, POWER = 0.05, 0.8
 Run = TypeVar("Run")
 
