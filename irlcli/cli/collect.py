@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from irlcli.cli.demonstrations import deliver_demonstrations
 from irlcli.cli.options import MAX_SEED, Name, OneSetting, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests import collect as requested
@@ -57,6 +58,7 @@ def collect_experts(
         episodes=episodes,
         seed=seed,
     )
-    for artefact in session.deliver([request], name):
-        for warning in requested.missed_bars(session, artefact):
+    found = deliver_demonstrations(session, request, name)
+    if found is not None:
+        for warning in requested.missed_bars(session, found):
             session.console.warn(warning)

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from irlcli.cli.demonstrations import deliver_demonstrations
 from irlcli.cli.options import Name, OneSetting, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests.collect import import_demonstrations
@@ -56,4 +57,4 @@ def import_(
         setting_column=setting_column,
         cut=cut,
     )
-    session.deliver([request], name)
+    deliver_demonstrations(session, request, name)

@@ -14,7 +14,7 @@ def print_rows(evaluations: Sequence[EvaluationRun], stderr: bool = False) -> No
             row.agent,
             f"{row.env} {row.setting}",
             f"{row.mean:.1f}",
-            "-" if row.deviation is None else f"{row.deviation:.1f}",
+            number(row.deviation),
             str(len(row.returns)),
             str(row.episodes),
         ]
@@ -30,5 +30,10 @@ def print_rows(evaluations: Sequence[EvaluationRun], stderr: bool = False) -> No
         if any(value is not None for value in values):
             columns.insert(4, column)
             for cells, value in zip(table, values, strict=True):
-                cells.insert(4, "-" if value is None else f"{value:.1f}")
+                cells.insert(4, number(value))
     out.print_table(columns, table, stderr=stderr)
+
+
+def number(value: float | None) -> str:
+    """``value`` as a table shows it."""
+    return "-" if value is None else f"{value:.1f}"

@@ -343,19 +343,22 @@ class CueContrast(Struct, frozen=True, kw_only=True):
     settings: Annotated[tuple[HintContrast, ...], Meta(min_length=1)]
 
 
-class SettingReturn(Struct, frozen=True, kw_only=True):
-    """Mean true return of an expert's demonstrations in one setting."""
+class Demonstrated(Struct, frozen=True, kw_only=True):
+    """The demonstrations of one setting. Imported ones may have no true reward."""
 
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
-    mean_return: Finite
+    mean_return: Finite | None
+    std_return: Finite | None
+    mean_progress: Finite | None
+    mean_length: Finite
 
 
-class Collected(Struct, frozen=True, kw_only=True):
-    """``summary.json`` of collect-experts."""
+class Demonstrations(Struct, frozen=True, kw_only=True):
+    """``summary.json`` of collect-experts and import."""
 
     env: str
-    settings: tuple[SettingReturn, ...]
+    settings: tuple[Demonstrated, ...]
 
 
 class SettingQuality(Struct, frozen=True, kw_only=True):

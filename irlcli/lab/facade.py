@@ -129,7 +129,7 @@ class Lab:
         }
         with self._at_work(configs, words("collect-experts", options)) as session:
             stored = self._run(session, collect.collect_experts(session, **options), name)
-            for warning in collect.missed_bars(session, stored._artefact):
+            for warning in collect.missed_bars(session, collect.summary(session, stored._artefact)):
                 session.console.warn(warning)
             return stored
 

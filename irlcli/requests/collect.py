@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from irlcli.configs.load import field_of
-from irlcli.data.descriptions import Collected
+from irlcli.data.descriptions import Demonstrations
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
 from irlcli.experiments.references import output, recorded
@@ -59,14 +59,18 @@ def collect_experts(
     return collect_stage.request(env, settings, config, seed, counts, experts, trust, normalisers)
 
 
-def missed_bars(session: StageSession, artefact: Artefact) -> Iterator[str]:
+def summary(session: StageSession, artefact: Artefact) -> Demonstrations:
+    """What the demonstrations in ``artefact`` are worth, by setting."""
+    return output(session.store, artefact, "summary.json", Demonstrations)
+
+
+def missed_bars(session: StageSession, summary: Demonstrations) -> Iterator[str]:
     """A warning for each expert whose mean true return is below the config's bar."""
-    summary = output(session.store, artefact, "summary.json", Collected)
     config = session.config(summary.env)
     for row in summary.settings:
         setting = without_cue(summary.env, parse_setting(summary.env, row.setting))
         bar = config.expert_of(setting).bar
-        if bar is not None and row.mean_return < bar:
+        if bar is not None and row.mean_return is not None and row.mean_return < bar:
             yield (
                 f"the expert of {summary.env} {row.setting} is below its bar: mean true return "
                 f"{row.mean_return:.0f} over {row.episodes} episodes, bar {bar:.0f}"

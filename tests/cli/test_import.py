@@ -125,6 +125,29 @@ def test_minari_has_no_place_for_an_unknown_reward(irl, store_copy, exported, mi
     assert not list((tmp_path / "minari").rglob("*.hdf5"))
 
 
+def test_demonstrations_are_described_by_setting(irl, store_copy, exported):
+    """Recorded or imported, new or found: the table has the means of the dataset's own episodes."""
+    datasets = read_demonstrations(Store(store_copy.path).resolve("demos").artefact.directory)
+    common = [*LANDER, "--store", store_copy.path]
+    smoke = ["--profile", "smoke"]
+    for line in (["import", exported], ["import", exported], ["collect-experts", *smoke]):
+        done = irl(*line, *common)
+        assert done.code == 0, done.err
+        assert len(done.out.splitlines()) == 1
+        for setting, episodes in datasets.trajectories.items():
+            returns = [episode.rewards.sum() for episode in episodes]
+            length = np.mean([len(episode.rewards) for episode in episodes])
+            values = (
+                f"{np.mean(returns):.1f} {np.std(returns, ddof=1):.1f} {length:.0f} {len(returns)}"
+            )
+            (row,) = [
+                row for row in done.err.splitlines() if row.startswith(f"lunar-lander {setting} ")
+            ]
+            assert row.split()[2:] == values.split()
+        document = json.loads(irl(*line, *common, "--json").out)
+        assert [row["setting"] for row in document["demonstrations"]] == list(datasets.trajectories)
+
+
 def test_an_import_is_a_hit_wherever_the_file_lies(irl, store_copy, exported, tmp_path):
     first = imported(irl, store_copy, exported, *LANDER, "--name", "own")
     moved = exported.rename(tmp_path / "moved.parquet")
@@ -141,6 +164,8 @@ def test_a_reward_is_learned_from_demonstrations_without_a_reward(irl, store_cop
     done = irl("import", exported, *LANDER, *common, "--name", "own")
     assert done.code == 0, done.err
     assert "no true reward" in done.err
+    rows = [row.split() for row in done.err.splitlines() if row.startswith("lunar-lander ")]
+    assert [row[2:4] for row in rows] == [["-", "-"]] * 2
     artefact = Store(store_copy.path).resolve("own").artefact
     summary = json.loads((artefact.directory / "summary.json").read_text())
     assert all(row["mean_return"] is None for row in summary["settings"])

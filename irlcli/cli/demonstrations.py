@@ -1,0 +1,47 @@
+"""Demonstrations that a command made: what they are worth, by setting."""
+
+from irlcli.cli import console as out
+from irlcli.cli.returns import number
+from irlcli.cli.session import StageSession
+from irlcli.data.descriptions import Demonstrations
+from irlcli.requests.collect import summary
+from irlcli.stages.base import Request
+
+
+def deliver_demonstrations(
+    session: StageSession, request: Request, name: str | None
+) -> Demonstrations | None:
+    """Run ``request``, and print a table beside its artefact. None with ``--dry-run``."""
+    import msgspec
+
+    artefacts = session.deliver(
+        [request],
+        name,
+        lambda made: {"demonstrations": msgspec.to_builtins(summary(session, made).settings)},
+    )
+    if not artefacts:
+        return None
+    found = summary(session, artefacts[0])
+    if not session.as_json:
+        _print(found)
+    return found
+
+
+def _print(found: Demonstrations) -> None:
+    columns = ["demonstrations", "true return", "sd", "progress", "length", "episodes"]
+    table = [
+        [
+            f"{found.env} {row.setting}",
+            number(row.mean_return),
+            number(row.std_return),
+            number(row.mean_progress),
+            f"{row.mean_length:.0f}",
+            str(row.episodes),
+        ]
+        for row in found.settings
+    ]
+    if all(row.mean_progress is None for row in found.settings):
+        del columns[3]
+        for cells in table:
+            del cells[3]
+    out.print_table(columns, table, stderr=True)
