@@ -92,6 +92,8 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
         listing = f"did you mean {close!r}? {listing}"
     elif re.fullmatch("[0-9a-f]{1,2}", text):
         listing = f"write at least 3 digits of an id; {listing}"
+    else:
+        listing += ", `irl pull NAME --from STORE` copies one from another store"
     return NotFound(f"{ref!r} names no artefact and no file", listing)
 
 
