@@ -41,8 +41,9 @@ from irlcli.store.manifest import (
     read_provenance,
 )
 from irlcli.store.read import Peek
+from irlcli.store.read import index as read_index
 from irlcli.store.remote_errors import explained
-from irlcli.store.substitute import Advance, Origin, check, sound_manifests, verified
+from irlcli.store.substitute import Advance, Origin, check, verified
 
 _CHUNK = 8 << 20
 # Small files fetched at a time: each is at most MAX_JSON_BYTES.
@@ -93,9 +94,9 @@ class Remote:
         return [name for name in self._list("") if is_id(name)]
 
     def index(self) -> Index:
-        """All whole artefacts; those with unreadable manifests are skipped with a warning."""
+        """All whole artefacts: see :func:`irlcli.store.read.index`."""
         self._fetch(f"{id16}/{MANIFEST}" for id16 in self.ids())
-        self._index = sound_manifests(self._layout, lambda text: self.warn(self._shown(text)))
+        self._index = read_index(self._layout, lambda text: self.warn(self._shown(text)))
         return self._index
 
     def manifests(self, id16: str) -> Index:

@@ -242,10 +242,8 @@ class Store:
 
     def manifests(self, id16: str) -> Index:
         """The sound manifests, read once: again only for an artefact that is newer than that."""
-        from irlcli.store.substitute import sound_manifests
-
         if self._index is None or id16 not in self._index.artefacts:
-            self._index = sound_manifests(self._layout, self.warn)
+            self._index = read.index(self._layout._replace(read_only=True), self.warn)
         return self._index
 
     def file(self, artefact: Artefact, path: str) -> Path:

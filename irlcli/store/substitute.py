@@ -22,7 +22,7 @@ from irlcli.store.integrity import problems
 from irlcli.store.layout import Layout
 from irlcli.store.manifest import Manifest, Output, encode_provenance, read_provenance
 from irlcli.store.publish import place_and_claim
-from irlcli.store.read import held_by, ids
+from irlcli.store.read import held_by
 from irlcli.store.scratch import Scratch
 
 Warn = Callable[[str], None]
@@ -51,17 +51,6 @@ class Origin(Protocol):
         Raises:
             IntegrityError: they cannot be read.
         """
-
-
-def sound_manifests(layout: Layout, warn: Warn) -> Index:
-    """The artefacts of another store; those with unreadable manifests are skipped with a warning."""
-    artefacts = {}
-    for id16 in ids(layout):
-        try:
-            artefacts[id16] = read_artefact(layout.root / id16)
-        except IntegrityError as error:
-            warn(f"skipping artefact {id16} of the store {layout.root}: {error.message}")
-    return Index(artefacts, {})
 
 
 def ancestors(artefact: Artefact, index: Index) -> list[Artefact]:

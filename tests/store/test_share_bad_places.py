@@ -72,6 +72,22 @@ def test_a_damaged_manifest_there_leaves_the_others(irl, store, chain, place, tm
 
 
 @pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
+def test_an_artefact_of_a_newer_schema_there_is_listed_as_such(irl, store, chain, place):
+    push(store, place, *chain.values())
+    newer = chain["airl"].id
+    if "://" in place:
+        memory().pipe_file(at(place, chain["airl"], "manifest.json"), b'{"schema": 2}')
+    else:
+        manifest = Path(place) / newer / "manifest.json"
+        manifest.chmod(0o644)
+        manifest.write_bytes(b'{"schema": 2}')
+    listed = irl("ls", "--json", "--from", place)
+    assert json.loads(listed.out)["newer"] == [newer]
+    assert f"skipping artefact {newer}: {place}/{newer}/manifest.json" in listed.err
+    assert "upgrade irlcli" in listed.err
+
+
+@pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
 def test_what_was_made_from_a_damaged_artefact_is_left_out_of_all(
     irl, store, chain, place, publish, tmp_path
 ):
