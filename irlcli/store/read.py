@@ -5,7 +5,6 @@ read-only store.
 """
 
 import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -147,15 +146,8 @@ def index(layout: Layout, warn: Callable[[str], None]) -> Index:
 
 
 def _size_problem(artefact: Artefact) -> str | None:
-    for output in artefact.manifest.outputs:
-        path = artefact.directory / output.path
-        try:
-            information = path.lstat()
-        except OSError as error:
-            return f"{path} cannot be read ({error.strerror})"
-        if not stat.S_ISREG(information.st_mode) or information.st_size != output.size:
-            return f"{path} is truncated or not a plain file"
-    return None
+    found = (output_problem(artefact.directory, o, quick=True) for o in artefact.manifest.outputs)
+    return next(filter(None, found), None)
 
 
 def _damaged(layout: Layout, directory: Path, problem: str) -> IrlError:

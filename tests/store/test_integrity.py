@@ -186,6 +186,19 @@ def test_verify_detects_an_artefact_that_is_a_link_out_of_the_store(empty_store,
     assert (tmp_path / "elsewhere" / "reward.pt").exists()  # what it pointed to is left alone
 
 
+@pytest.mark.parametrize("name", [".", "nested"])
+def test_find_follows_no_link(empty_store, victim, tmp_path, name):
+    path, key = victim.directory / name, victim.manifest.record.key
+    path.chmod(0o755)
+    shutil.move(path, tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    found = empty_store.peek(key)
+    assert found.artefact is None and "is reached through a symbolic link" in found.problem
+    with pytest.raises(IntegrityError, match="is reached through a symbolic link"):
+        empty_store.find(key)
+    assert_set_aside(empty_store, victim)
+
+
 def test_verify_detects_a_linked_directory_inside(empty_store, victim, tmp_path):
     shutil.move(victim.directory / "nested", tmp_path / "nested")
     (victim.directory / "nested").symlink_to(tmp_path / "nested")

@@ -312,9 +312,12 @@ def test_a_damaged_ancestor_is_left_out_with_a_warning(tmp_path, zoo, kind):
 
 
 def test_an_artefact_that_is_a_link_is_refused(store, zoo, tmp_path):
+    source = zoo.open()
+    found = find_in([source], zoo.key("airl"))
     shutil.move(zoo["airl"].directory, tmp_path / "elsewhere")
     zoo["airl"].directory.symlink_to(tmp_path / "elsewhere")
-    assert adopt(store, zoo) is None
+    assert find_in([source], zoo.key("airl")) is None
+    assert store.adopt(source, found.artefact) is None
     assert zoo["airl"].id not in store.ids()
 
 
