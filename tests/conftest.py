@@ -118,7 +118,7 @@ def _build_chain(store: Path) -> dict[str, str]:
         done = run_main([*arguments, *common])
         assert done.code == 0, done.err
         ids[field] = Path(done.out.strip()).name
-    demos = Store(store).get(ids["demos"])
+    demos = Store(store).resolve(ids["demos"]).artefact
     (expert,) = Store(store).index().parents(demos)["expert engine-power=1x"]
     return {**ids, "expert": expert.id}
 

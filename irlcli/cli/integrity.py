@@ -32,7 +32,7 @@ def verify(
         ids = session.store.ids()
     else:
         ids = [session.artefact(ref).id]
-    found, index = session.store.verify_all(ids, quick)
+    found, index = session.store.verify(ids, quick)
     newer = [id16 for id16, damage in found.items() if damage.newer]
     damaged = {id16: damage for id16, damage in found.items() if not damage.newer}
     for id16 in newer:

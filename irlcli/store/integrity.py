@@ -32,6 +32,13 @@ class Damage(NamedTuple):
     newer: bool = False
 
 
+class Verified(NamedTuple):
+    """Damaged artefacts by id, and the index of the sound ones. Those of a newer schema are in both."""
+
+    damaged: dict[str, Damage]
+    sound: Index
+
+
 def problems(layout: Layout, id16: str, quick: bool = False) -> list[str]:
     """The problems of the artefact ``id16``; empty if it is sound. Changes nothing.
 
@@ -75,12 +82,8 @@ def _file_problems(artefact: Artefact, quick: bool) -> list[str]:
     return found
 
 
-def verify(layout: Layout, ids: Iterable[str], quick: bool) -> tuple[dict[str, Damage], Index]:
-    """Check artefacts and move the damaged ones to quarantine.
-
-    Returns the damaged artefacts by id, and the index of the others. Artefacts of a newer schema
-    are in both and are not moved.
-    """
+def verify(layout: Layout, ids: Iterable[str], quick: bool) -> Verified:
+    """Check artefacts and move the damaged ones to quarantine, except those of a newer schema."""
     found: dict[str, Damage] = {}
     sound, unknown = {}, {}
     for id16 in ids:
@@ -106,7 +109,7 @@ def verify(layout: Layout, ids: Iterable[str], quick: bool) -> tuple[dict[str, D
                 if place is None:
                     continue
         found[id16] = Damage(failed, command, place)
-    return found, Index(sound, unknown)
+    return Verified(found, Index(sound, unknown))
 
 
 def damaged(layout: Layout, directory: Path, problem: str) -> IrlError:

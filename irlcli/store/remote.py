@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import fsspec
 
@@ -43,7 +43,10 @@ from irlcli.store.manifest import (
 from irlcli.store.read import Peek
 from irlcli.store.read import index as read_index
 from irlcli.store.remote_errors import explained
-from irlcli.store.substitute import Advance, Origin, check, verified
+from irlcli.store.substitute import Advance, check, verified
+
+if TYPE_CHECKING:
+    from irlcli.store.sources import Place
 
 _CHUNK = 8 << 20
 # Small files fetched at a time: each is at most MAX_JSON_BYTES.
@@ -172,7 +175,7 @@ class Remote:
         return copy
 
     def contents(self, id16: str) -> tuple[Manifest, dict[str, Any]]:
-        """Manifest and provenance of an artefact whose files are all there: see :class:`Origin`."""
+        """Manifest and provenance of a whole artefact: see :meth:`irlcli.store.Store.contents`."""
         self._fetch([f"{id16}/{MANIFEST}", f"{id16}/{PROVENANCE}"])
         directory = self._layout.root / id16
         with self._errors():
@@ -189,7 +192,7 @@ class Remote:
             return manifest, read_provenance(directory, manifest.id)
 
     def read(self, id16: str, output: Output) -> Iterator[bytes]:
-        """The bytes of an output as they are: see :class:`Origin`."""
+        """The bytes of an output as they are, in chunks."""
         # A request of its own for each chunk bounds the memory, whatever the protocol buffers.
         for start in range(0, output.size, _CHUNK):
             with self._errors():
@@ -230,7 +233,7 @@ class Remote:
         sizes = self._sizes(artefact.id)
         return PROVENANCE in sizes and all(sizes.get(p, -1) == size for p, size in wanted.items())
 
-    def receive(self, source: Origin, artefact: Artefact, advance: Advance) -> None:
+    def receive(self, source: Place, artefact: Artefact, advance: Advance) -> None:
         """Write a copy of an artefact of ``source``, its manifest last, and read it back.
 
         Raises:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from irlcli.errors import RETRY, IntegrityError, StageFailed, UsageError
 from irlcli.store import layout as layouts
 from irlcli.store import read, references
-from irlcli.store.artefact import Artefact, Published
+from irlcli.store.artefact import Artefact, Published, read_artefact
 from irlcli.store.claim import reading
 from irlcli.store.index import Index
 from irlcli.store.layout import Layout
@@ -29,13 +29,14 @@ from irlcli.store.scratch import CHECKPOINT, Scratch
 # which most commands are, loads none of them.
 if TYPE_CHECKING:
     from irlcli.store.collect import Missing
-    from irlcli.store.integrity import Damage
+    from irlcli.store.integrity import Verified
     from irlcli.store.manifest import Manifest, Output
-    from irlcli.store.remote import Remote
-    from irlcli.store.substitute import Advance, Origin
+    from irlcli.store.sources import Place
+    from irlcli.store.substitute import Advance
 
 # Stores of this process about which the user was told that their file system has no locks.
 _WITHOUT_LOCKS: set[Path] = set()
+_CHUNK = 1 << 20
 
 
 class Store:
@@ -111,10 +112,6 @@ class Store:
     def peek(self, key: str) -> read.Peek:
         """What :meth:`find` would find, changing nothing: see :func:`irlcli.store.read.peek`."""
         return read.peek(self._layout, key)
-
-    def get(self, id16: str) -> Artefact:
-        """The artefact with the id ``id16``: see :func:`irlcli.store.read.get`."""
-        return read.get(self._layout, id16)
 
     def open(self, artefact: Artefact, path: str) -> Path:
         """The checked file of an output: see :func:`irlcli.store.read.open_output`."""
@@ -228,7 +225,7 @@ class Store:
 
         return publish(self._writable, record, output, provenance)
 
-    def adopt(self, other: Store | Remote, artefact: Artefact) -> Published | None:
+    def adopt(self, other: Place, artefact: Artefact) -> Published | None:
         """Copy an artefact and its ancestors: see :func:`irlcli.store.substitute.adopt`.
 
         To be called as :meth:`publish` is, under :meth:`in_use` and :meth:`working_on`.
@@ -251,22 +248,36 @@ class Store:
         return artefact.directory / artefact.output(path).path
 
     def contents(self, id16: str) -> tuple[Manifest, dict[str, Any]]:
-        """Manifest and provenance: see :class:`irlcli.store.substitute.Origin`."""
-        from irlcli.store.substitute import contents
+        """Manifest and provenance of an artefact, all of whose files are there with their sizes.
 
-        return contents(self._layout, id16)
+        Raises:
+            IntegrityError: it is damaged or not whole.
+        """
+        # Finds damaged JSON, wrong sizes, symbolic links and unlisted files before any copying.
+        if found := self.problems(id16, quick=True):
+            raise IntegrityError(found[0])
+        artefact = read_artefact(self.root / id16)
+        return artefact.manifest, artefact.provenance()
 
     def read(self, id16: str, output: Output) -> Iterator[bytes]:
-        """The bytes of an output: see :class:`irlcli.store.substitute.Origin`."""
-        from irlcli.store import substitute
+        """The bytes of an output as they are, in chunks.
 
-        return substitute.read(self._layout, id16, output)
+        Raises:
+            IntegrityError: they cannot be read.
+        """
+        path = self.root / id16 / output.path
+        try:
+            with open(path, "rb") as file:
+                while chunk := file.read(_CHUNK):
+                    yield chunk
+        except OSError as error:
+            raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
 
     def holds(self, artefact: Artefact) -> bool:
         """Whether the artefact is here with all its files. Compares sizes; hashes nothing."""
         return not self.problems(artefact.id, quick=True)
 
-    def receive(self, source: Origin, artefact: Artefact, advance: Advance) -> None:
+    def receive(self, source: Place, artefact: Artefact, advance: Advance) -> None:
         """Copy one artefact: see :func:`irlcli.store.substitute.receive`."""
         from irlcli.store.durable import remove_leftovers
         from irlcli.store.substitute import receive
@@ -296,12 +307,8 @@ class Store:
 
         return problems(self._layout, id16, quick)
 
-    def verify(self, ids: Iterable[str], quick: bool = False) -> dict[str, Damage]:
-        """The damaged of the artefacts ``ids``: see :func:`irlcli.store.integrity.verify`."""
-        return self.verify_all(ids, quick)[0]
-
-    def verify_all(self, ids: Iterable[str], quick: bool) -> tuple[dict[str, Damage], Index]:
-        """As :meth:`verify`, and the index of the sound ones, whose manifests it has read."""
+    def verify(self, ids: Iterable[str], quick: bool = False) -> Verified:
+        """Check artefacts: see :func:`irlcli.store.integrity.verify`."""
         from irlcli.store.integrity import verify
 
         return verify(self._layout, ids, quick)

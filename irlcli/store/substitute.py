@@ -1,9 +1,7 @@
 """Copying an artefact and its ancestors from another store, every byte verified.
 
-The other store is on disk or behind a URL (:mod:`irlcli.store.remote`): see :class:`Origin`.
-
-The other store is only read: nothing is locked, moved or repaired there. A damaged artefact there
-is reported and treated as missing.
+The other store is on disk or behind a URL (:mod:`irlcli.store.remote`). It is only read: nothing is
+locked, moved or repaired there. A damaged artefact there is reported and treated as missing.
 """
 
 from __future__ import annotations
@@ -11,46 +9,24 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 from irlcli.errors import IntegrityError
-from irlcli.store.artefact import Artefact, Published, read_artefact
+from irlcli.store.artefact import Artefact, Published
 from irlcli.store.durable import unique_name
 from irlcli.store.index import Index
-from irlcli.store.integrity import problems
 from irlcli.store.layout import Layout
-from irlcli.store.manifest import Manifest, Output, encode_provenance, read_provenance
+from irlcli.store.manifest import Manifest, Output, encode_provenance
 from irlcli.store.publish import place_and_claim
 from irlcli.store.read import held_by
 from irlcli.store.scratch import Scratch
 
+if TYPE_CHECKING:
+    from irlcli.store.sources import Place
+
 Warn = Callable[[str], None]
 # Receives the number of bytes that were copied.
 Advance = Callable[[int], None]
-_CHUNK = 1 << 20
-
-
-class Origin(Protocol):
-    """A store that artefacts are copied from."""
-
-    @property
-    def root(self) -> Path | str:
-        """Its directory or URL."""
-
-    def contents(self, id16: str) -> tuple[Manifest, dict[str, Any]]:
-        """Manifest and provenance of an artefact, all of whose files are there with their sizes.
-
-        Raises:
-            IntegrityError: it is damaged or not whole.
-        """
-
-    def read(self, id16: str, output: Output) -> Iterator[bytes]:
-        """The bytes of an output as they are, in chunks.
-
-        Raises:
-            IntegrityError: they cannot be read.
-        """
 
 
 def ancestors(artefact: Artefact, index: Index) -> list[Artefact]:
@@ -72,7 +48,7 @@ def ancestors(artefact: Artefact, index: Index) -> list[Artefact]:
 
 
 def adopt(
-    layout: Layout, source: Origin, artefact: Artefact, before: Sequence[Artefact], warn: Warn
+    layout: Layout, source: Place, artefact: Artefact, before: Sequence[Artefact], warn: Warn
 ) -> Published | None:
     """Publish verified copies of the ancestors ``before`` an artefact, and of the artefact itself.
 
@@ -105,7 +81,7 @@ def adopt(
 
 
 def receive(
-    layout: Layout, source: Origin, id16: str, advance: Advance = lambda _: None
+    layout: Layout, source: Place, id16: str, advance: Advance = lambda _: None
 ) -> Published:
     """Publish a verified copy of one artefact.
 
@@ -130,7 +106,7 @@ def receive(
         shutil.rmtree(copy, ignore_errors=True)
 
 
-def verified(source: Origin, id16: str, output: Output) -> Iterator[bytes]:
+def verified(source: Place, id16: str, output: Output) -> Iterator[bytes]:
     """The bytes of an output, in chunks.
 
     The digest is of the bytes that were yielded, so a file that changes meanwhile is noticed.
@@ -150,7 +126,7 @@ def verified(source: Origin, id16: str, output: Output) -> Iterator[bytes]:
         raise IntegrityError(f"{source.root}/{id16}/{output.path} differs from the published bytes")
 
 
-def check(source: Origin, id16: str, manifest: Manifest) -> None:
+def check(source: Place, id16: str, manifest: Manifest) -> None:
     """Hash every output of an artefact.
 
     Raises:
@@ -159,24 +135,3 @@ def check(source: Origin, id16: str, manifest: Manifest) -> None:
     for output in manifest.outputs:
         for _ in verified(source, id16, output):
             pass
-
-
-def contents(layout: Layout, id16: str) -> tuple[Manifest, dict[str, Any]]:
-    """:meth:`Origin.contents` of a store on disk."""
-    # Finds damaged JSON, wrong sizes, symbolic links and unlisted files before any copying.
-    found = problems(layout, id16, quick=True)
-    if found:
-        raise IntegrityError(found[0])
-    directory, manifest = read_artefact(layout.root / id16)
-    return manifest, read_provenance(directory, manifest.id)
-
-
-def read(layout: Layout, id16: str, output: Output) -> Iterator[bytes]:
-    """:meth:`Origin.read` of a store on disk."""
-    path = layout.root / id16 / output.path
-    try:
-        with open(path, "rb") as file:
-            while chunk := file.read(_CHUNK):
-                yield chunk
-    except OSError as error:
-        raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None

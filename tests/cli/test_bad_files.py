@@ -112,7 +112,7 @@ def test_the_hostile_files_would_run_code_where_pickles_are_trusted(tmp_path):
 @pytest.mark.parametrize("kind", hostile_pickles(Path("x")))
 def test_no_code_in_a_checkpoint_is_run(irl, store_copy, tmp_path, kind):
     """A checkpoint is as writable as the rest of the store; one that is no good is not for ever."""
-    record = Store(store_copy.path).get(store_copy.transfer).manifest.record
+    record = Store(store_copy.path).resolve(store_copy.transfer).artefact.manifest.record
     (store_copy.path / ".keys" / record.key).unlink()
     header = provenance.Header(
         schema=provenance.SCHEMA,

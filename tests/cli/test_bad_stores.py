@@ -288,7 +288,7 @@ def test_file_size_limit(store_copy):
     done = Done(line, preexec_fn=small_files_only)
     assert_answered(done, 1, "evaluate")
     store = Store(store_copy.path)
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
 
 
 # Locks
@@ -320,7 +320,7 @@ def hold():
 
 
 def test_busy(irl, store_copy, hold):
-    key = Store(store_copy.path).get(store_copy.transfer).manifest.record.key
+    key = Store(store_copy.path).resolve(store_copy.transfer).artefact.manifest.record.key
     (store_copy.path / ".keys" / key).unlink()
     pid = hold(store_copy.path / ".locks" / key)
     text = "transfer --reward airl --ood 1.5x --no-wait"

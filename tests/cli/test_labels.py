@@ -70,7 +70,8 @@ def test_ls_shows_the_method_behind_transfers_and_evaluations(irl, store_copy):
     listed = irl("ls", "--store", store_copy.path).out
     (transfer,) = (row for row in listed.splitlines() if store_copy.transfer in row)
     (score,) = (row for row in listed.splitlines() if store_copy.evaluation in row)
-    made = Store(store_copy.path).get(store_copy.airl).manifest.record.parameters["airl"]
+    record = Store(store_copy.path).resolve(store_copy.airl).artefact.manifest.record
+    made = record.parameters["airl"]
     learned = f"of train-airl irm lambda {made['penalty_weight']:g} seed 0"
     assert learned in transfer
     assert f"of transfer seed 0 {learned}" in score
@@ -81,7 +82,7 @@ def test_ls_shows_the_method_behind_transfers_and_evaluations(irl, store_copy):
 def test_listings_tell_how_policies_were_retrained_and_for_how_long(irl, store_copy, publish):
     """Three transfers on one reward, which differ in nothing but that."""
     store = Store(store_copy.path)
-    made = store.get(store_copy.transfer).manifest.record
+    made = store.resolve(store_copy.transfer).artefact.manifest.record
     config = made.parameters["transfer"]
     changes = [({"ceiling": 0.9}, {}), ({}, {"start": "0" * 64}), ({"total_steps": 4096}, {})]
     for number, (changed, start) in enumerate(changes):

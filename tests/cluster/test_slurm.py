@@ -153,7 +153,7 @@ def verified(runs, whole):
     # A job that was killed as it published leaves a checkpoint, which nobody needs.
     done(runs.start("gc", "--delete", "--grace-days", "0", "--store", runs.store))
     assert Store(runs.store).ids() == whole
-    assert Store(runs.store).verify(whole) == {}
+    assert Store(runs.store).verify(whole).damaged == {}
     assert list((runs.store / ".quarantine").iterdir()) == []
     assert list((runs.store / ".work").iterdir()) == []
     assert list((runs.store / ".jobs").iterdir()) == []
@@ -242,7 +242,7 @@ def test_two_people_with_overlapping_tables_make_each_artefact_once(runs, whole)
     done(second)
     assert set(whole) < set(Store(runs.store).ids())
     assert set(runs.computed().values()) == {1}
-    assert Store(runs.store).verify(Store(runs.store).ids()) == {}
+    assert Store(runs.store).verify(Store(runs.store).ids()).damaged == {}
 
 
 def test_gc_beside_it_takes_nothing_that_is_in_use(runs, whole, cluster):
@@ -320,7 +320,7 @@ def test_every_machine_with_its_own_mount_of_a_store_on_the_network(tmp_path, wh
         assert "on n" in done(second)
         assert set(runs.computed().values()) == {1}
         ids = Store(served / "store").ids()
-        assert set(whole) < set(ids) and Store(served / "store").verify(ids) == {}
+        assert set(whole) < set(ids) and Store(served / "store").verify(ids).damaged == {}
         assert "submitted" not in done(runs.submit("--tag", "first"))
     finally:
         cluster.stop()

@@ -289,7 +289,8 @@ def test_nothing_is_run(report, table_store):
     partly = report("table1", table_store, *ROW, seeds="0,1,2")
     assert any("train-airl has not run: AIRL-ERM 2; AIRL-IRM 2" in n for n in caveats(partly))
     made = set(Store(table_store).ids()) - before
-    assert {Store(table_store).get(i).manifest.record.stage for i in made} == {"report"}
+    store = Store(table_store)
+    assert {store.resolve(i).artefact.manifest.record.stage for i in made} == {"report"}
 
 
 def test_one_seed_has_no_p_value(report, table_store):

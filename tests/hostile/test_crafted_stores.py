@@ -57,7 +57,7 @@ def save_checkpoint(store: Store, key: str, stage: Stage, state: dict, attempts=
 
 def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
     store = Store(store_copy.path)
-    key = store.get(store_copy.transfer).manifest.record.key
+    key = store.resolve(store_copy.transfer).artefact.manifest.record.key
     (store.root / ".keys" / key).unlink()
     # So that the artefact is written anew, with the provenance of this run.
     remove(store.root / store_copy.transfer)
@@ -65,7 +65,7 @@ def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
     save_checkpoint(store, key, transfer.STAGE, {"other": torch.ones(1)}, attempts)
     done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
     assert done.code == 0 and "starting over" in done.err
-    assert store.get(store_copy.transfer).provenance()["resumed"] == 0
+    assert store.resolve(store_copy.transfer).artefact.provenance()["resumed"] == 0
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
 def test_a_planted_checkpoint_is_named(irl, store_copy, changes):
     """Valid tensors, header and checksum around a state that no stage wrote."""
     store = Store(store_copy.path)
-    key = store.get(store_copy.transfer).manifest.record.key
+    key = store.resolve(store_copy.transfer).artefact.manifest.record.key
     (store.root / ".keys" / key).unlink()
     rows = torch.frombuffer(bytearray(b"[]"), dtype=torch.uint8)
     state = {"training": TRAINING, "rows": rows, **changes}
@@ -109,7 +109,7 @@ def test_a_planted_gridworld_checkpoint_is_named(irl, maze_store, tmp_path, chan
     path = tmp_path / "runs"
     shutil.copytree(maze_store, path, symlinks=True)
     store = Store(path)
-    found = store.get(store.names()["maxent"]).manifest.record
+    found = store.resolve(store.names()["maxent"]).artefact.manifest.record
     (store.root / ".keys" / found.key).unlink()
     state = {"iterations": 1, "networks": {}, "optimizer": {}, "records": [], **changes}
     save_checkpoint(store, found.key, train_maxent.STAGE, state)
@@ -163,7 +163,7 @@ def test_links_pipes_and_strays_in_the_scratch_directory_are_not_followed(
     outside.mkdir()
     (outside / "precious").write_text("kept")
     store = Store(store_copy.path)
-    key = store.get(store_copy.transfer).manifest.record.key
+    key = store.resolve(store_copy.transfer).artefact.manifest.record.key
     (store.root / ".keys" / key).unlink()
     plant(store, key, outside)
     done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
@@ -191,7 +191,7 @@ def test_scratch_directories_locks_names_and_claims_that_are_links_are_not_follo
     outside.mkdir()
     (outside / "precious").write_text("kept" * 10)
     store = Store(store_copy.path)
-    key = store.get(store_copy.transfer).manifest.record.key
+    key = store.resolve(store_copy.transfer).artefact.manifest.record.key
     claim, lock, work = (store.root / part / key for part in (".keys", ".locks", ".work"))
     claim.unlink()
     work.symlink_to(outside)
@@ -247,7 +247,7 @@ def test_huge_numbers_in_a_manifest_are_no_obstacle_to_listing(irl, publish, tmp
 
 def planted(store: Store, source: str, name: str, data: bytes) -> None:
     """Replace ``source`` by an artefact with valid digests whose output ``name`` is ``data``."""
-    artefact = store.get(source)
+    artefact = store.resolve(source).artefact
     record = artefact.manifest.record
     files = {o.path: (artefact.directory / o.path).read_bytes() for o in artefact.manifest.outputs}
     (store.root / ".keys" / record.key).unlink()

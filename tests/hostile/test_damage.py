@@ -40,7 +40,7 @@ def test_damage_of_any_file_is_found_on_read_and_by_verify(store_copy, field):
     sound = store_copy.path.parent / "sound"
     shutil.copytree(store_copy.path / id16, sound)
     foreign = next(store.root / i for i in store.ids() if i != id16)
-    key, found = store.get(id16).manifest.record.key, files_of(sound)
+    key, found = store.resolve(id16).artefact.manifest.record.key, files_of(sound)
     assert {"manifest.json", "provenance.json"} < {p.name for p in found}
     for file in found:
         name = file.relative_to(sound)
@@ -53,20 +53,20 @@ def test_damage_of_any_file_is_found_on_read_and_by_verify(store_copy, field):
                 damage(place / name, same.read_bytes())
                 if reading:
                     with pytest.raises(IntegrityError) as caught:
-                        artefact = store.get(id16)
+                        artefact = store.resolve(id16).artefact
                         artefact.provenance()
                         for output in artefact.manifest.outputs:
                             store.open(artefact, output.path)
                     assert id16 in caught.value.message, (name, kind)
                 if not reading or place.exists():  # reading altered provenance quarantines nothing
-                    assert list(store.verify([id16])) == [id16], (name, kind)
+                    assert list(store.verify([id16]).damaged) == [id16], (name, kind)
                 assert not place.exists()
                 assert not (store.root / ".keys" / key).exists()
                 (moved,) = (store.root / ".quarantine").iterdir()
                 shutil.rmtree(moved)
                 shutil.copytree(sound, place)
                 (store.root / ".keys" / key).write_text(id16)
-    assert store.verify([id16]) == {}
+    assert store.verify([id16]).damaged == {}
 
 
 def test_damaged_artefacts_are_made_again_with_the_same_ids_in_another_environment(
@@ -91,7 +91,7 @@ def test_damaged_artefacts_are_made_again_with_the_same_ids_in_another_environme
             victim = files_of(store.root / id16)[-1]
             victim.chmod(0o644)
             flip(victim, b"")
-        assert set(store.verify(store.ids())) == set(before[stores.index(store)])
+        assert set(store.verify(store.ids()).damaged) == set(before[stores.index(store)])
     environment = {
         **{k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG", "IRL_"))},
         **{"PYTHONHASHSEED": "12345", "LC_ALL": "C", "TZ": "Asia/Kathmandu"},
@@ -107,4 +107,4 @@ def test_damaged_artefacts_are_made_again_with_the_same_ids_in_another_environme
         assert {
             n: (store.root / n / "manifest.json").read_bytes() for n in store.ids()
         } == manifests
-        assert store.verify(store.ids()) == {}
+        assert store.verify(store.ids()).damaged == {}

@@ -57,7 +57,7 @@ def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab):
     assert (config["total_steps"], config["ppo"]["n_epochs"]) == (1024, 1)
     before = stored(lab)
     for one in made:
-        record = Store(lab.store).get(one.id).provenance()
+        record = Store(lab.store).resolve(one.id).artefact.provenance()
         done = irl(*record["command"][1:])
         assert (done.code, done.out.strip()) == (0, str(one.path)), done.err
         assert done.err.startswith("HIT ")
@@ -138,7 +138,7 @@ def test_an_assessment_is_the_commands_and_a_table_of_its_bank(lab, irl):
     kinds = {entry["kind"]: entry["true"]["mean"] for entry in document["bank"]}
     verdicts = {split["policy"]: split["verdict"] for split in setting["retrained"]}
     assert judged == (verdicts if kinds["expert"] > kinds["random"] else {})
-    record = Store(lab.store).get(made.id).provenance()
+    record = Store(lab.store).resolve(made.id).artefact.provenance()
     done = irl(*record["command"][1:], "--json")
     assert json.loads(done.out)["id"] == made.id and "HIT assess" in done.err
 

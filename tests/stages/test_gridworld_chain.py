@@ -331,4 +331,4 @@ def test_killed_and_run_again_it_is_the_same(tmp_path, stage):
     assert resumed.manifest.id == undisturbed.manifest.id
     assert [a.provenance()["resumed"] for a in (resumed, undisturbed)] == [1, 0]
     store = Store(tmp_path / "killed")
-    assert not store.verify(store.ids())
+    assert not store.verify(store.ids()).damaged

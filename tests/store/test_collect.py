@@ -81,7 +81,7 @@ def test_names_and_their_ancestors_are_kept(empty_store, family, named, kept):
     removed, _ = empty_store.collect(DAY)
     assert ids(*removed) == everything - spared
     assert set(empty_store.ids()) == spared
-    assert empty_store.verify(empty_store.ids()) == {}
+    assert empty_store.verify(empty_store.ids()).damaged == {}
     for artefact in removed:
         assert empty_store.find(artefact.manifest.record.key) is None
     assert list((empty_store.root / ".work").iterdir()) == []
@@ -117,7 +117,7 @@ def test_dry_run_removes_nothing(empty_store, family):
 
 def test_what_a_damaged_name_protects_is_not_deleted(irl, empty_store, family):
     protected = empty_store.ids()[0]
-    empty_store.set_name("best", empty_store.get(protected))
+    empty_store.set_name("best", empty_store.resolve(protected).artefact)
     for damage in ("", "garbage!!\n"):
         (empty_store.root / ".names" / "best").write_text(damage)
         listed = irl("gc", "--grace-days", "0", "--store", empty_store.root)
@@ -154,7 +154,7 @@ def test_another_users_artefacts_are_left(empty_store, family, monkeypatch):
     empty_store.warn = said.append
     removed, _ = empty_store.collect(DAY)
     assert sorted(artefact.id for artefact in removed) == ours
-    assert empty_store.ids() == [theirs] and not empty_store.verify([theirs])
+    assert empty_store.ids() == [theirs] and not empty_store.verify([theirs]).damaged
     assert len(said) == 1 and theirs in said[0]
     key = next(iter(empty_store.artefacts())).manifest.record.key
     assert empty_store.find(key) is not None

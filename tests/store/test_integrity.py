@@ -111,7 +111,7 @@ def test_verify_detects_sets_aside_and_recomputing_repairs(
 ):
     store, untouched = empty_store, bystander(empty_store, victim)
     DAMAGE[kind](victim.directory / name, untouched.directory / name)
-    damaged = store.verify(store.ids())
+    damaged = store.verify(store.ids()).damaged
     assert list(damaged) == [victim.id]
     assert name in " ".join(damaged[victim.id].problems)
     assert_set_aside(store, victim)
@@ -119,7 +119,7 @@ def test_verify_detects_sets_aside_and_recomputing_repairs(
     assert store.find(untouched.manifest.record.key) == untouched
     again = publish(store, parameters=PARAMETERS)
     assert (again.artefact.id, again.diverged) == (victim.id, None)
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
 
 
 @pytest.mark.parametrize("name", ["extra.pt", "nested/extra", ".hidden", "new/extra"])
@@ -134,7 +134,7 @@ def test_verify_detects_added_files(empty_store, victim, name, kind):
             path.symlink_to("/nowhere")
         case "fifo":
             os.mkfifo(path)
-    assert name in " ".join(empty_store.verify([victim.id])[victim.id].problems)
+    assert name in " ".join(empty_store.verify([victim.id]).damaged[victim.id].problems)
     assert_set_aside(empty_store, victim)
 
 
@@ -150,7 +150,7 @@ def test_verify_detects_a_file_below_more_directories_than_pythons_stack_has_fra
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(len(inspect.stack(0)) + 200)
     try:
-        (problem,) = empty_store.verify([victim.id])[victim.id].problems
+        (problem,) = empty_store.verify([victim.id]).damaged[victim.id].problems
     finally:
         sys.setrecursionlimit(limit)
     assert problem.endswith("/d/extra is not in the manifest")
@@ -181,7 +181,7 @@ def test_verify_detects_an_artefact_that_is_a_link_out_of_the_store(empty_store,
     victim.directory.chmod(0o755)
     shutil.move(victim.directory, tmp_path / "elsewhere")
     victim.directory.symlink_to(tmp_path / "elsewhere")
-    assert list(empty_store.verify([victim.id])) == [victim.id]
+    assert list(empty_store.verify([victim.id]).damaged) == [victim.id]
     assert not victim.directory.is_symlink()
     assert (tmp_path / "elsewhere" / "reward.pt").exists()  # what it pointed to is left alone
 
@@ -202,7 +202,7 @@ def test_find_follows_no_link(empty_store, victim, tmp_path, name):
 def test_verify_detects_a_linked_directory_inside(empty_store, victim, tmp_path):
     shutil.move(victim.directory / "nested", tmp_path / "nested")
     (victim.directory / "nested").symlink_to(tmp_path / "nested")
-    assert list(empty_store.verify([victim.id])) == [victim.id]
+    assert list(empty_store.verify([victim.id]).damaged) == [victim.id]
 
 
 def test_swapped_artefacts_are_both_detected(empty_store, victim):
@@ -213,7 +213,7 @@ def test_swapped_artefacts_are_both_detected(empty_store, victim):
     victim.directory.rename(empty_store.root / ".swap")
     other.directory.rename(victim.directory)
     (empty_store.root / ".swap").rename(other.directory)
-    assert set(empty_store.verify(empty_store.ids())) == {victim.id, other.id}
+    assert set(empty_store.verify(empty_store.ids()).damaged) == {victim.id, other.id}
     assert empty_store.ids() == []
 
 
@@ -247,9 +247,9 @@ def test_open_of_a_sound_file_beside_a_damaged_one(empty_store, victim):
 
 def test_quick_verify_sees_sizes_only(empty_store, victim):
     flip(0.5)(victim.directory / "reward.pt", victim.directory)
-    assert empty_store.verify([victim.id], quick=True) == {}
+    assert empty_store.verify([victim.id], quick=True).damaged == {}
     rewrite(victim.directory / "reward.pt", lambda data: data[:-1])
-    assert list(empty_store.verify([victim.id], quick=True)) == [victim.id]
+    assert list(empty_store.verify([victim.id], quick=True).damaged) == [victim.id]
 
 
 def test_the_word_newer_in_a_path_does_not_hide_damage(tmp_path, publish):
@@ -270,7 +270,7 @@ def test_verify_survives_an_artefact_that_gc_removes_meanwhile(empty_store, vict
     listed = empty_store.ids()
     victim.directory.chmod(0o755)
     shutil.rmtree(victim.directory)
-    assert empty_store.verify(listed) == {}  # gone is not damaged
+    assert empty_store.verify(listed).damaged == {}  # gone is not damaged
     assert len(listed) == 2
     assert list((empty_store.root / ".quarantine").iterdir()) == []
 
@@ -393,12 +393,12 @@ def test_newer_schema_is_named_and_left_where_it_is(empty_store, victim):
     rewrite(victim.directory / "manifest.json", bump)
     for read in (
         lambda: empty_store.find(victim.manifest.record.key),
-        lambda: empty_store.get(victim.id),
+        lambda: empty_store.resolve(victim.id),
     ):
         with pytest.raises(IntegrityError, match="schema 2, newer") as caught:
             read()
         assert "upgrade" in caught.value.hint
-    found = empty_store.verify([victim.id])[victim.id]
+    found = empty_store.verify([victim.id]).damaged[victim.id]
     assert found.newer and found.place is None and "newer" in " ".join(found.problems)
     assert victim.id in empty_store.ids()
     assert (empty_store.root / ".keys" / victim.manifest.record.key).exists()
@@ -596,7 +596,7 @@ def test_rubbish_among_pointers_is_ignored(empty_store, victim, place):
     empty_store.set_name("mine", victim)
     assert empty_store.names()["mine"] == victim.id
     flip(0.5)(victim.directory / "reward.pt", victim.directory)
-    assert list(empty_store.verify(empty_store.ids())) == [victim.id]
+    assert list(empty_store.verify(empty_store.ids()).damaged) == [victim.id]
     assert empty_store.find("f" * 64) is None
 
 

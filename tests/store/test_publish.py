@@ -42,7 +42,7 @@ def stage_output(store: Store, files: dict[str, bytes], attempt_name: str) -> Pa
 
 def assert_whole_or_absent(store: Store) -> None:
     """Whatever readers can see is complete and unaltered."""
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
     found = store.find(RECORD.key)
     if found is not None:
         for name, data in FILES.items():
@@ -58,7 +58,7 @@ def assert_publishes_again(store: Store, expected: str) -> None:
     found = store.find(RECORD.key)
     assert found is not None and found.id == expected
     assert store.ids() == [expected]
-    assert store.verify([expected]) == {}
+    assert store.verify([expected]).damaged == {}
     assert list((store.root / ".quarantine").iterdir()) == []
 
 
@@ -262,7 +262,7 @@ def test_find_before_and_after(tmp_path):
     artefact = attempt(store).artefact
     assert store.find(RECORD.key) == artefact
     assert store.find("0" * 64) is None
-    assert Store(store.root).get(artefact.id).manifest == artefact.manifest
+    assert Store(store.root).resolve(artefact.id).artefact.manifest == artefact.manifest
 
 
 def test_equal_content_is_one_artefact(tmp_path):
@@ -296,7 +296,7 @@ def test_second_different_result_is_kept_and_reported(tmp_path):
     assert second.artefact.id != first.id
     assert store.find(RECORD.key) == first  # the first writer wins
     assert store.ids() == sorted([first.id, second.artefact.id])
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
 
 
 def test_damaged_twin_is_replaced_not_trusted(tmp_path):
@@ -345,7 +345,7 @@ def test_two_publishers_interleaved_at_every_step(tmp_path, other):
         with pytest.MonkeyPatch.context() as patch:
             intercept(patch.setattr, at_call)
             slow = store.publish(RECORD, output, {"command": ["irl", "train-airl"]})
-        assert store.verify(store.ids()) == {}
+        assert store.verify(store.ids()).damaged == {}
         if won is None:
             break
         # The first claim holds the key, both processes report it, and both results are kept.
@@ -379,7 +379,7 @@ def test_many_processes_publish_at_once(tmp_path):
         children.append(pid)
     assert [os.waitpid(pid, 0)[1] for pid in children] == [0] * 6
     assert len(store.ids()) == 2
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
     found = store.find(RECORD.key)
     assert found is not None and found.id in store.ids()
 

@@ -99,13 +99,13 @@ def test_a_read_only_store_reports_damage_and_moves_nothing(empty_store, artefac
         store.find(artefact.manifest.record.key)
     assert "irl train-airl" in caught.value.hint
     if "manifest" in kind:
-        for read in (lambda: store.resolve("best"), lambda: store.get(artefact.id)):
+        for read in (lambda: store.resolve("best"), lambda: store.resolve(artefact.id)):
             with pytest.raises(IntegrityError):
                 read()
     else:
         with pytest.raises(IntegrityError):
             store.open(artefact, "reward.pt")
-    assert list(store.verify(store.ids())) == [artefact.id]
+    assert list(store.verify(store.ids()).damaged) == [artefact.id]
     assert tree(empty_store.root) == before
 
 
@@ -119,7 +119,7 @@ def test_a_read_only_store_needs_none_of_its_own_directories(empty_store, artefa
         assert store.find(artefact.manifest.record.key) == artefact
         assert store.resolve(artefact.id[:5]).artefact == artefact
         assert store.open(artefact, "reward.pt").is_file()
-        assert store.names() == {} and store.verify(store.ids()) == {}
+        assert store.names() == {} and store.verify(store.ids()).damaged == {}
         assert store.garbage(-1.0) == [artefact] and store.stale_work(-1.0) == []
     assert tree(empty_store.root) == before
 

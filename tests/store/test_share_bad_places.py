@@ -45,7 +45,7 @@ def test_damage_there_is_named_and_not_published(
     assert result.code == 4 and f"{url}/{chain[which].id}/{name}" in result.err, result.err
     theirs = other(tmp_path)
     assert not {chain[which].id, chain["airl"].id} & set(theirs.ids())
-    assert theirs.verify(theirs.ids()) == {}
+    assert theirs.verify(theirs.ids()).damaged == {}
     # A push repairs what it can see: the size of what the manifest lists, and of the manifest.
     if damage is not flip and name != "provenance.json":
         push(store, url, chain["airl"])
@@ -176,7 +176,7 @@ def test_only_outputs_are_taken(store, chain, url, tmp_path):
     theirs = other(tmp_path)
     assert Remote(url, pytest.fail).peek("0" * 64) == (None, None)
     pull(url, theirs, chain["expert"].id)
-    assert files_of(theirs.get(chain["expert"].id)) == files_of(chain["expert"])
+    assert files_of(theirs.resolve(chain["expert"].id).artefact) == files_of(chain["expert"])
     assert theirs.ids() == [chain["expert"].id] and theirs.names() == {}
     assert not theirs.has_checkpoint(key)
 

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from irlcli.errors import Busy, IntegrityError, NotFound
-from irlcli.store import Index, KeyRecord, Store, collect, integrity
+from irlcli.store import Index, KeyRecord, Store, collect, integrity, read
 from irlcli.store import artefact as artefact_module
 from irlcli.store import publish as publishing
+from irlcli.store.layout import Layout
 
 DAY = 86400.0
 
@@ -300,7 +301,7 @@ def test_what_was_repaired_meanwhile_is_not_set_aside(empty_store, publish, monk
     before_the_next_repair(monkeypatch, repair)
     with pytest.raises(Busy, match="repaired"):
         store.open(artefact, "reward.pt")
-    assert store.ids() == [artefact.id] and store.verify([artefact.id]) == {}
+    assert store.ids() == [artefact.id] and store.verify([artefact.id]).damaged == {}
 
 
 def test_a_removed_artefact_is_missing_not_damaged(empty_store, publish):
@@ -310,7 +311,7 @@ def test_a_removed_artefact_is_missing_not_damaged(empty_store, publish):
     with pytest.raises(NotFound, match="missing"):
         empty_store.open(artefact, "reward.pt")
     with pytest.raises(NotFound, match="missing"):
-        empty_store.get(artefact.id)
+        read.get(Layout(empty_store.root), artefact.id)
     assert empty_store.find(artefact.manifest.record.key) is None
 
 
@@ -456,5 +457,5 @@ def test_verify_survives_what_disappears_while_it_is_read(
         return original(*arguments)
 
     monkeypatch.setattr(module, call, vanishing)
-    assert empty_store.verify([artefact.id]) == {}
+    assert empty_store.verify([artefact.id]).damaged == {}
     assert list((empty_store.root / ".quarantine").iterdir()) == []

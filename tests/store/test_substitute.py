@@ -110,7 +110,7 @@ def test_the_artefact_and_its_ancestors_are_copied_byte_for_byte(store, zoo):
     for original in zoo.made.values():
         found = store.find(original.manifest.record.key)
         assert_same(found, original)
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
     assert list((store.root / ".work").iterdir()) == []
     assert zoo.tree() == before and zoo.warnings == []
 
@@ -198,7 +198,7 @@ def test_a_shipped_store_can_be_used_as_it_is(zoo, publish):
     found = store.find(zoo.key("airl"))
     store.set_name("best", found)
     publish(store, parameters={"seed": 5})
-    assert len(store.ids()) == 4 and store.verify(store.ids()) == {}
+    assert len(store.ids()) == 4 and store.verify(store.ids()).damaged == {}
     assert len(store.collect(-1.0)[0]) == 1
 
 
@@ -333,7 +333,7 @@ def test_what_vanishes_between_finding_and_copying_is_a_miss(store, zoo):
 
 
 def assert_whole_or_absent(store: Store, zoo: Zoo) -> None:
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
     for original in (zoo["expert"], zoo["demos"]):
         found = store.find(original.manifest.record.key)
         if found is not None:
@@ -344,7 +344,7 @@ def assert_adopts_again(store: Store, zoo: Zoo, *names: str) -> None:
     """The last of ``names``, with its ancestors before it."""
     artefact = adopt(store, zoo, names[-1]).artefact
     assert set(store.ids()) == {zoo[name].id for name in names}
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
     assert list((store.root / ".quarantine").iterdir()) == []
     for name in names:
         assert_same(store.find(zoo.key(name)), zoo[name])
@@ -468,7 +468,7 @@ def test_what_another_store_has_is_not_computed_again(irl, smoke_store, tmp_path
     result = irl(*line)
     assert result.code == 0 and "RUN " not in result.err, result.err
     assert Path(result.out.strip()).name == smoke_store.demos
-    assert Store(tmp_path).verify(Store(tmp_path).ids()) == {}
+    assert Store(tmp_path).verify(Store(tmp_path).ids()).damaged == {}
 
 
 def test_what_is_damaged_there_is_computed_with_a_warning(irl, tmp_path):

@@ -117,14 +117,14 @@ def checker(root: Path) -> None:
     def work() -> None:
         store = Store(root)
         with store.in_use(wait=True):
-            assert store.verify(store.ids()) == {}
+            assert store.verify(store.ids()).damaged == {}
             index = store.index()
             for name in store.names().values():
                 assert name in index.artefacts
         # Again without the lock, as on file systems without flock.
         store.garbage(0.0)
         store.stale_work(0.0)
-        assert store.verify(store.ids()) == {}
+        assert store.verify(store.ids()).damaged == {}
         time.sleep(0.05)
 
     until_told(work, root)
@@ -166,7 +166,7 @@ def store_alone(work: Path, rounds: int) -> dict[str, int]:
         # Made or copied once, and once more for each time that it was collected.
         assert count - collected[key] in (0, 1), (key, made, collected)
     store = Store(root)
-    assert store.verify(store.ids()) == {}
+    assert store.verify(store.ids()).damaged == {}
     assert list((root / ".quarantine").iterdir()) == []
     assert contents(work / "zoo") == before
     return {
@@ -208,7 +208,7 @@ def commands_at_once(work: Path, processes: int) -> dict[str, int]:
     assert len(set(ended[0].out.split() + ended[3].out.split())) == 1
     must(irl(root, "gc", "--delete", "--grace-days", "0"))
     store = Store(root)
-    assert len(store.ids()) == 6 and store.verify(store.ids()) == {}
+    assert len(store.ids()) == 6 and store.verify(store.ids()).damaged == {}
     return {"processes": processes, "stages run": runs.total(), "gc, verify and ls beside": beside}
 
 
@@ -226,7 +226,7 @@ def table_rows(work: Path) -> dict[str, int]:
         done = subprocess.run(line, capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stderr
         store = Store(root)
-        assert store.verify(store.ids()) == {}
+        assert store.verify(store.ids()).damaged == {}
         assert before in ([], store.ids())
         before = store.ids()
     assert "RUN " not in done.stderr

@@ -206,7 +206,7 @@ class Chain:
             return
         store = Store(root)
         ids = store.ids()
-        assert store.verify(ids) == {}
+        assert store.verify(ids).damaged == {}
         assert set(ids) <= set(self.ids[stage]), (ids, self.ids[stage])
         assert set(store.names().values()) <= set(ids)
 
