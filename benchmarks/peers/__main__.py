@@ -27,6 +27,7 @@ from irlcli.experiments.provenance import git_state
 from irlcli.experiments.references import demonstrations
 from irlcli.interventions import parse_settings
 from irlcli.store import Store
+from irlcli.store.claim import Patience
 from irlcli.store.lock import locked
 
 _ROOT = Path(__file__).parents[2]
@@ -85,7 +86,7 @@ def _run(options: argparse.Namespace) -> None:
     for directory in (runs, options.out / "records"):
         directory.mkdir(parents=True, exist_ok=True)
     # Two processes would delete each other's unfinished runs.
-    alone = locked(runs / ".lock", what=f"the runs in {runs}")
+    alone = locked(runs / ".lock", Patience(f"the runs in {runs}"))
     with nullcontext() if options.report else alone:
         _run_in(runs, options)
 

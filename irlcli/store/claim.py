@@ -28,23 +28,18 @@ _POLL_SECONDS = 2.0
 _READER = ".reader"
 
 
-class _Said(NamedTuple):
-    """What a claim says of its holder; nothing, if it cannot be read."""
+class Holder(NamedTuple):
+    """What the claim ``path`` says of its holder, and when it was touched [s].
 
+    A claim that cannot be read says nothing.
+    """
+
+    path: Path
+    touched: float
     host: str = ""
     machine: str = ""
     process: int = 0
     token: str = ""
-
-
-class Holder(NamedTuple):
-    """Who wrote a claim, and how long ago it was touched [s]."""
-
-    host: str
-    machine: str
-    process: int
-    token: str
-    age: float
 
     def __str__(self) -> str:
         return f"process {self.process} on {self.host}" if self.host else "another process"
@@ -53,81 +48,80 @@ class Holder(NamedTuple):
         """Whether it is at work. Where locks work, the caller holds the lock of this machine."""
         if self.machine == machine() and (locks_work or not alive(self.process)):
             return False
-        return self.age < STALE_SECONDS
+        return _now(self.path.parent) - self.touched < STALE_SECONDS
+
+
+class Patience:
+    """Whether to wait for whoever is working on ``what``.
+
+    Args:
+        what: for the error message.
+        wait: wait instead of raising.
+        on_wait: called once, with a description of the holder, before waiting.
+    """
+
+    def __init__(
+        self,
+        what: str = "the same artefact",
+        wait: bool = False,
+        on_wait: Callable[[str], None] | None = None,
+    ):
+        self._what, self._wait, self._on_wait = what, wait, on_wait
+
+    def meet(self, holder: Holder | str) -> None:
+        """Return if the caller is to wait for ``holder``.
+
+        Raises:
+            Busy: it is not.
+        """
+        if not self._wait:
+            raise Busy(f"{holder} is working on {self._what}", "try again later")
+        if self._on_wait is not None:
+            self._on_wait(str(holder))
+            self._on_wait = None
 
 
 @contextmanager
-def claimed(
-    path: Path,
-    locks_work: bool,
-    *,
-    wait: bool,
-    on_wait: Callable[[str], None] | None,
-    what: str,
-) -> Iterator[None]:
+def claimed(path: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
     """Hold the claim ``path``. Call this while holding the lock of this machine, if it has locks.
 
     Without effect where the file cannot be written, for example on a full disk.
 
     Raises:
-        Busy: a live process holds it and ``wait`` is false.
+        Busy: a live process holds it, and ``patience`` is not to wait.
     """
     token = os.urandom(16).hex()
-    patience = _Patience(wait, on_wait, what)
     while not _create(path, token):
         holder = read(path)
         if holder is None:
             continue
-        if not holder.lives(locks_work):
+        if holder.lives(locks_work):
+            patience.meet(holder)
+            time.sleep(_POLL_SECONDS)
+        else:
             _remove(path, holder.token)
-            continue
-        patience.wait_for(holder)
     with _beating(path, token):
         yield
 
 
 @contextmanager
-def reading(
-    directory: Path,
-    gc: Path,
-    locks_work: bool,
-    *,
-    wait: bool,
-    on_wait: Callable[[str], None] | None,
-    what: str,
-) -> Iterator[None]:
+def reading(directory: Path, gc: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
     """Keep the holder of the claim ``gc`` from starting, by a file of one's own in ``directory``.
 
     Raises:
-        Busy: ``gc`` is held by a live process and ``wait`` is false.
+        Busy: a live process holds ``gc``, and ``patience`` is not to wait.
     """
     token = os.urandom(16).hex()
-    patience = _Patience(wait, on_wait, what)
     while True:
         own = directory / unique_name(_READER)
-        if not _create(own, token):
-            continue
+        _create(own, token)
         with _beating(own, token):
             # Each of the two writes its own file before it looks for the other's.
             holder = read(gc)
             if holder is None or not holder.lives(locks_work):
                 yield
                 return
-        patience.wait_for(holder)
-
-
-class _Patience:
-    """Whether to wait for a holder, and whom to tell of it once."""
-
-    def __init__(self, wait: bool, on_wait: Callable[[str], None] | None, what: str):
-        self._wait, self._on_wait, self._what = wait, on_wait, what
-
-    def wait_for(self, holder: Holder) -> None:
-        if not self._wait:
-            raise Busy(f"{holder} is working on {self._what}", "try again later")
-        if self._on_wait is not None:
-            self._on_wait(str(holder))
-            self._on_wait = None
+        patience.meet(holder)
         time.sleep(_POLL_SECONDS)
 
 
@@ -149,20 +143,6 @@ def is_claimed(path: Path) -> bool:
 
 def read(path: Path) -> Holder | None:
     """The holder of a claim; None if nobody holds it."""
-    found = _content(path)
-    if found is None:
-        return None
-    said, touched = found
-    return Holder(*said, _now(path.parent) - touched)
-
-
-def _token(path: Path) -> str | None:
-    found = _content(path)
-    return None if found is None else found[0].token
-
-
-def _content(path: Path) -> tuple[_Said, float] | None:
-    """What a claim says, and when it was touched [s]; None without a claim."""
     try:
         # Opened and not only looked up, so that a file system of the network asks its server.
         with open(path, "rb", opener=_open) as file:
@@ -172,14 +152,19 @@ def _content(path: Path) -> tuple[_Said, float] | None:
         return None
     except OSError:
         # A link or a directory, for example: no claim, and to be removed.
-        return _Said(), 0.0
+        return Holder(path, 0.0)
     try:
         said = json.loads(text)
         host, where, token = (str(said[field]) for field in ("host", "machine", "token"))
-        return _Said(host, where, int(said["process"]), token), touched
+        return Holder(path, touched, host, where, int(said["process"]), token)
     except (ValueError, KeyError, TypeError):
         # It is being written, or the disk was full.
-        return _Said(), touched
+        return Holder(path, touched)
+
+
+def _token(path: Path) -> str | None:
+    holder = read(path)
+    return None if holder is None else holder.token
 
 
 def _open(path: str, flags: int) -> int:
@@ -201,12 +186,17 @@ def _now(directory: Path) -> float:
 
 def _create(path: Path, token: str) -> bool:
     """Create the claim; False if it exists. True also where it cannot be written at all."""
-    said = _Said(os.uname().nodename, machine(), os.getpid(), token)
+    said = {
+        "host": os.uname().nodename,
+        "machine": machine(),
+        "process": os.getpid(),
+        "token": token,
+    }
     # Linked when it is whole: the holder of an empty claim is unknown, and lives until it is stale.
     whole = path.with_name(unique_name(f".{path.name}"))
     try:
         with open(whole, "x") as file, suppress(OSError):
-            file.write(json.dumps(said._asdict()))
+            file.write(json.dumps(said))
         os.link(whole, path)
     except FileExistsError:
         return False
@@ -225,8 +215,7 @@ def _remove(path: Path, token: str) -> None:
         os.rename(path, aside)
     except FileNotFoundError:
         return
-    found = read(aside)
-    if found is not None and found.token != token:
+    if _token(aside) not in (token, None):
         # Another process took it over first: give it back.
         with suppress(FileExistsError):
             os.link(aside, path)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from irlcli.errors import Busy, IntegrityError
+from irlcli.errors import IntegrityError
 from irlcli.store.artefact import Artefact, recorded_command, stored_inputs
-from irlcli.store.claim import live_reader
+from irlcli.store.claim import Patience, live_reader
 from irlcli.store.durable import remove, remove_leftovers
 from irlcli.store.index import Index
 from irlcli.store.integrity import quarantined
@@ -115,10 +115,10 @@ def collect(
     if not layout.marker.exists():
         return [], []
     make_directories(layout)
-    with exclusive(layout.gc_lock, what=f"the store {layout.root}") as no_locks:
-        reader = live_reader(layout.locks, locks_work=no_locks is None)
-        if reader is not None:
-            raise Busy(f"{reader} is working on the store {layout.root}", "try again later")
+    no_patience = Patience(f"the store {layout.root}")
+    with exclusive(layout.gc_lock, no_patience) as no_locks:
+        if reader := live_reader(layout.locks, locks_work=no_locks is None):
+            no_patience.meet(reader)
         if damaged := damaged_names(layout):
             raise IntegrityError(
                 f"{layout.names / damaged[0]} is damaged, so gc does not know what the name protects",

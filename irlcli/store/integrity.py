@@ -13,6 +13,7 @@ from irlcli.store.artefact import (
     read_artefact,
     recorded_command,
 )
+from irlcli.store.claim import Patience
 from irlcli.store.index import Index
 from irlcli.store.layout import Layout, claims
 from irlcli.store.lock import exclusive
@@ -174,4 +175,4 @@ def quarantined(layout: Layout, id16: str) -> Path | None:
 def repairing(layout: Layout):
     """A lock: one process at a time removes damaged artefacts and pointers."""
     layout.locks.mkdir(exist_ok=True)
-    return exclusive(layout.locks / "repair", wait=True)
+    return exclusive(layout.locks / "repair", Patience(wait=True))

@@ -9,24 +9,19 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from irlcli.errors import Busy
-from irlcli.store.claim import claimed, is_claimed
+from irlcli.store.claim import Patience, claimed, is_claimed
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
 def locked(
-    path: Path,
-    *,
-    shared: bool = False,
-    wait: bool = False,
-    on_wait: Callable[[str], None] | None = None,
-    what: str = "the same artefact",
+    path: Path, patience: Patience | None = None, shared: bool = False
 ) -> Iterator[str | None]:
     """Hold a lock on ``path``. The kernel releases it however the process ends.
 
@@ -34,13 +29,11 @@ def locked(
 
     Args:
         path: lock file, created if absent.
+        patience: whether to wait for the present holder; by default, not.
         shared: allow several holders.
-        wait: wait for the present holder instead of raising.
-        on_wait: called once with a description of the holder before waiting.
-        what: what is locked, for the error message.
 
     Raises:
-        Busy: held by another process and ``wait`` is false.
+        Busy: another process holds it, and ``patience`` is not to wait.
     """
     # A shared lock needs no write permission, so readers of a read-only store can take it.
     access = os.O_RDONLY if shared else os.O_RDWR
@@ -52,11 +45,7 @@ def locked(
             fcntl.flock(descriptor, mode | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
-            holder = holder or "another process"
-            if not wait:
-                raise Busy(f"{holder} is working on {what}", "try again later") from None
-            if on_wait is not None:
-                on_wait(holder)
+            (patience or Patience()).meet(holder or "another process")
             fcntl.flock(descriptor, mode)
         except OSError as error:
             if error.errno not in _NO_LOCKS:
@@ -73,17 +62,11 @@ def locked(
 
 
 @contextmanager
-def exclusive(
-    path: Path,
-    *,
-    wait: bool = False,
-    on_wait: Callable[[str], None] | None = None,
-    what: str = "the same artefact",
-) -> Iterator[str | None]:
+def exclusive(path: Path, patience: Patience) -> Iterator[str | None]:
     """As :func:`locked`, also between machines: the lock, and a claim beside it."""
     with (
-        locked(path, wait=wait, on_wait=on_wait, what=what) as problem,
-        claimed(claim_of(path), problem is None, wait=wait, on_wait=on_wait, what=what),
+        locked(path, patience) as problem,
+        claimed(claim_of(path), problem is None, patience),
     ):
         yield problem
 

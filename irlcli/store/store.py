@@ -18,7 +18,7 @@ from irlcli.errors import RETRY, IntegrityError, StageFailed, UsageError
 from irlcli.store import layout as layouts
 from irlcli.store import read, references
 from irlcli.store.artefact import Artefact, Published, read_artefact
-from irlcli.store.claim import reading
+from irlcli.store.claim import Patience, reading
 from irlcli.store.index import Index
 from irlcli.store.layout import Layout
 from irlcli.store.lock import claim_of, exclusive, locked
@@ -182,16 +182,15 @@ class Store:
         if self._layout.read_only or not lockable:
             yield
             return
-        what = f"the store {self.root}"
-        with locked(lock, shared=True, wait=wait, on_wait=on_wait, what=what) as problem:
+        patience = Patience(f"the store {self.root}", wait, on_wait)
+        with locked(lock, patience, shared=True) as problem:
             if problem is not None and self.root not in _WITHOUT_LOCKS:
                 _WITHOUT_LOCKS.add(self.root)
                 self.warn(
                     f"{self.root} is on a file system without locks ({problem}): claims with a "
                     "heartbeat stand in for them (docs/store.md)"
                 )
-            gc, locks_work = claim_of(lock), problem is None
-            with reading(self._layout.locks, gc, locks_work, wait=wait, on_wait=on_wait, what=what):
+            with reading(self._layout.locks, claim_of(lock), problem is None, patience):
                 yield
 
     @contextmanager
@@ -210,7 +209,7 @@ class Store:
         """
         layouts.make_directories(self._writable)
         directory = self._layout.work / key
-        with exclusive(self._layout.locks / key, wait=wait, on_wait=on_wait, what=what):
+        with exclusive(self._layout.locks / key, Patience(what, wait, on_wait)):
             if os.path.lexists(directory) and (directory.is_symlink() or not directory.is_dir()):
                 raise IntegrityError(f"{directory} is not a directory", "remove it")
             yield Scratch(directory)
