@@ -1,6 +1,6 @@
 """The numbers of a report: cells, comparisons, learned returns, and the discriminators' ends.
 
-Every function takes *points*, a row per evaluation and setting with the columns
+Most functions take *points*: a row per evaluation and setting with the columns
 
     row           ENV KNOB
     agent         method or baseline

@@ -2,8 +2,9 @@
 
 Some shared file systems lock for one machine only, or not at all. A claim is a file that its
 holder touches every :data:`HEARTBEAT_SECONDS`. One that was not touched for
-:data:`STALE_SECONDS` is taken over. As locks, claims only save work: a holder that was suspended
-for longer, and wakes up, does no harm beyond doing the same work twice.
+:data:`STALE_SECONDS` is taken over. A holder that was suspended for longer, and wakes up, does at
+most the same work twice. A reader that was suspended for longer may find that gc has deleted an old
+artefact without a name: its command fails, and can be run again.
 
 Ages are differences between two times of the same file system, so that the clocks of the machines
 need not agree.

@@ -46,7 +46,11 @@ class Index:
         return [self.artefacts[id16] for id16 in self._holders.get(sha, [])]
 
     def reached_from(self, ids: Iterable[str]) -> set[str]:
-        """The artefacts ``ids`` and all artefacts of a newer schema, with their ancestors."""
+        """The ids of all that must be kept with ``ids``.
+
+        Those of ``ids`` that exist, what the manifests of a newer schema mention, and all their
+        ancestors.
+        """
         reached: set[str] = set()
         pending = [id16 for id16 in ids if id16 in self.artefacts]
         for manifest in self.newer.values():

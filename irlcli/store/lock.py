@@ -1,6 +1,7 @@
-"""Advisory file locks (flock). They only avoid duplicate work; publishing is safe without them.
+"""Advisory file locks (flock).
 
-They hold between the processes of one machine. Between machines, and on file systems without
+Publishing is safe without them. They avoid duplicate work, and keep gc from deleting what a command
+is using. They hold between the processes of one machine. Between machines, and on file systems without
 locks, claims do this (:mod:`irlcli.store.claim`).
 """
 
