@@ -1,4 +1,4 @@
-"""A table of many runs on a cluster: its plan, its job arrays, its store, and the claims of 200 nodes.
+"""A table of many runs on a cluster: its plan, its job arrays, its store, and the leases of 200 nodes.
 
 Artefacts are written without training, each with the outputs that later steps read. Lines with CPU
 seconds and peak memory are processes of their own, start-up included.
@@ -27,7 +27,7 @@ from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import load_table
 from irlcli.stages.base import From, Request
 from irlcli.store import KeyRecord, Manifest, Output, Store
-from irlcli.store.claim import HEARTBEAT_SECONDS, live_reader, read
+from irlcli.store.lease import HEARTBEAT_SECONDS, live_reader, read
 from irlcli.store.manifest import encode_provenance
 
 METHODS = ["erm", "irm", "irm-shuffled", "erm-balanced", "vrex", "iga", "group-dro", "l2"]
@@ -35,7 +35,7 @@ METHODS += ["dropout", "gail"]
 ROWS = ("lunar-lander.engine-power", "lunar-lander.bounce")
 NODES = 200
 # The lock of the step, the reader's file, and the lock that an output is published under.
-CLAIMS = 3
+LEASES = 3
 ATTEMPT = provenance.Attempt(
     started="2026-01-01T00:00:00Z", seconds=1.0, commit="0" * 40, dirty=None
 )
@@ -63,7 +63,7 @@ def main() -> None:
         last = list(plan.tasks)[-1]
         report("run --only, one step", [*IRL, "run", "big", "--only", last, *words])
         report("gc, dry run", [*IRL, "gc", "--store", str(place / "runs")])
-        claims(store)
+        leases(store)
 
 
 def table_file(place: Path, runs: int) -> Path:
@@ -149,8 +149,8 @@ def write_artefact(
     (store.root / ".locks" / record.key).touch()
 
 
-def claims(store: Store) -> None:
-    """What a command's claims cost, and those of many nodes together."""
+def leases(store: Store) -> None:
+    """What a command's leases cost, and those of many nodes together."""
     count = 200
     started = time.monotonic()
     for _ in range(count):
@@ -163,20 +163,20 @@ def claims(store: Store) -> None:
             pass
     working = (time.monotonic() - started) / count
     print(
-        f"claim to read the store {1000 * reading:.2f} ms, to make an artefact {1000 * working:.2f} ms"
+        f"lease to read the store {1000 * reading:.2f} ms, to make an artefact {1000 * working:.2f} ms"
     )
     # Those of other machines: gc may not tell from the process whether they live.
     locks = store.root / ".locks"
     for node in range(NODES):
-        claim = {"host": f"node{node}", "process": 1, "token": "x"}
-        (locks / f".reader.{node}.1").write_text(json.dumps(claim))
+        lease = {"host": f"node{node}", "process": 1, "token": "x"}
+        (locks / f".reader.{node}.1").write_text(json.dumps(lease))
     files = [locks / f".reader.{node}.1" for node in range(NODES)]
     started = time.monotonic()
     for path in files:
         assert read(path) is not None
         os.utime(path)
     beat = (time.monotonic() - started) / NODES
-    rate = NODES * CLAIMS / HEARTBEAT_SECONDS
+    rate = NODES * LEASES / HEARTBEAT_SECONDS
     print(f"{NODES} nodes: {rate:.0f} heartbeats/s, {1000 * rate * beat:.1f} ms of each second")
     started = time.monotonic()
     assert live_reader(locks, locks_work=True) is not None

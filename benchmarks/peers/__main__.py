@@ -27,7 +27,7 @@ from irlcli.experiments.provenance import git_state
 from irlcli.experiments.references import demonstrations
 from irlcli.interventions import parse_settings
 from irlcli.store import Store
-from irlcli.store.claim import Patience
+from irlcli.store.lease import Patience
 from irlcli.store.lock import locked
 
 _ROOT = Path(__file__).parents[2]

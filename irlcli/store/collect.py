@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 from irlcli.errors import IntegrityError
 from irlcli.store.artefact import Artefact, recorded_command, stored_inputs
-from irlcli.store.claim import Patience, live_reader
 from irlcli.store.durable import remove, remove_leftovers
 from irlcli.store.index import Index
 from irlcli.store.integrity import quarantined
 from irlcli.store.layout import Layout, claims, make_directories
-from irlcli.store.lock import claim_of, exclusive, is_locked
+from irlcli.store.lease import Patience, live_reader
+from irlcli.store.lock import exclusive, is_locked, lease_of
 from irlcli.store.read import index as read_index
 from irlcli.store.references import damaged_names, names
 
@@ -158,7 +158,7 @@ def collect(
 
 
 def _remove_lock(path: Path) -> None:
-    for file in (path, claim_of(path)):
+    for file in (path, lease_of(path)):
         file.unlink(missing_ok=True)
 
 

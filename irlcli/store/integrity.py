@@ -13,9 +13,9 @@ from irlcli.store.artefact import (
     read_artefact,
     recorded_command,
 )
-from irlcli.store.claim import Patience
 from irlcli.store.index import Index
 from irlcli.store.layout import Layout, claims
+from irlcli.store.lease import Patience
 from irlcli.store.lock import exclusive
 from irlcli.store.manifest import MANIFEST, PROVENANCE, read_provenance
 

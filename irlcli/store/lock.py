@@ -2,7 +2,7 @@
 
 Publishing is safe without them. They avoid duplicate work, and keep gc from deleting what a command
 is using. They hold between the processes of one machine. Between machines, and on file systems without
-locks, claims do this (:mod:`irlcli.store.claim`).
+locks, leases do this (:mod:`irlcli.store.lease`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from irlcli.errors import Busy
-from irlcli.store.claim import Patience, claimed, is_claimed
+from irlcli.store.lease import Patience, is_leased, leased
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
@@ -64,22 +64,23 @@ def locked(
 
 @contextmanager
 def exclusive(path: Path, patience: Patience) -> Iterator[str | None]:
-    """As :func:`locked`, also between machines: the lock, and a claim beside it."""
+    """As :func:`locked`, also between machines: the lock, and a lease beside it."""
     with (
         locked(path, patience) as problem,
-        claimed(claim_of(path), problem is None, patience),
+        leased(lease_of(path), problem is None, patience),
     ):
         yield problem
 
 
-def claim_of(path: Path) -> Path:
-    """The claim beside the lock ``path``."""
+def lease_of(path: Path) -> Path:
+    """The lease beside the lock ``path``."""
+    # As earlier versions call it, which may use the same store.
     return path.with_name(f"{path.name}.claim")
 
 
 def is_locked(path: Path) -> bool:
     """Whether a process holds ``path`` exclusively."""
-    if is_claimed(claim_of(path)):
+    if is_leased(lease_of(path)):
         return True
     if not path.exists():
         return False

@@ -18,10 +18,10 @@ from irlcli.errors import RETRY, IntegrityError, StageFailed, UsageError
 from irlcli.store import layout as layouts
 from irlcli.store import read, references
 from irlcli.store.artefact import Artefact, Published, read_artefact
-from irlcli.store.claim import Patience, reading
 from irlcli.store.index import Index
 from irlcli.store.layout import Layout
-from irlcli.store.lock import claim_of, exclusive, locked
+from irlcli.store.lease import Patience, reading
+from irlcli.store.lock import exclusive, lease_of, locked
 from irlcli.store.manifest import KeyRecord
 from irlcli.store.scratch import CHECKPOINT, Scratch
 
@@ -187,10 +187,10 @@ class Store:
             if problem is not None and self.root not in _WITHOUT_LOCKS:
                 _WITHOUT_LOCKS.add(self.root)
                 self.warn(
-                    f"{self.root} is on a file system without locks ({problem}): claims with a "
+                    f"{self.root} is on a file system without locks ({problem}): leases with a "
                     "heartbeat stand in for them (docs/store.md)"
                 )
-            with reading(self._layout.locks, claim_of(lock), problem is None, patience):
+            with reading(self._layout.locks, lease_of(lock), problem is None, patience):
                 yield
 
     @contextmanager

@@ -1,6 +1,6 @@
 """``irl run --cluster slurm`` on a real Slurm: ``make test-cluster``.
 
-The jobs, their command lines, signals, claims and artefacts are real. What the stages compute is
+The jobs, their command lines, signals, leases and artefacts are real. What the stages compute is
 replaced by rounds of a hash chain (``tests/experiments/fake_stages``), so that a table with
 two rows, three methods and three seeds takes a minute on two cores. One test trains a smaller
 table.
@@ -314,7 +314,7 @@ def test_every_machine_with_its_own_mount_of_a_store_on_the_network(tmp_path, wh
         runs = Runs(tmp_path / "runs", cluster)
         runs.store = mounted / "store"
         first = runs.submit("--tag", "first", **SLOW)
-        # On the login node: it sees the jobs by their claims only.
+        # On the login node: it sees the jobs by their leases only.
         second = runs.table("--jobs", "2", "--tag", "second", *UNTIL, name="other", **SLOW)
         done(first)
         assert "on n" in done(second)

@@ -72,11 +72,11 @@ def killed_at_random(chain: Chain, stage: str, work: Path, wanted: int) -> tuple
 
 
 def refused_calls(
-    chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool], claims: bool
+    chain: Chain, stage: str, work: Path, stride: int, persists: Sequence[bool], leases: bool
 ) -> int:
     """One kind of call fails, once or from a point on; returns the number of failed runs.
 
-    Those of claims and locks, which a run may survive, only if ``claims``.
+    Those of leases and locks, which a run may survive, only if ``leases``.
     """
     refused = 0
     for call, number in (
@@ -92,7 +92,7 @@ def refused_calls(
             unharmed = 0
             for n in range(0, _ENOUGH, stride):
                 store = chain.fresh(stage, work / "store")
-                spared = None if claims else store / ".locks"
+                spared = None if leases else store / ".locks"
                 fault = Fault(n, number, persist, (call,), spared=spared)
                 ended = irl(store, *command(stage), fault=fault)
                 chain.assert_sound(stage, store)

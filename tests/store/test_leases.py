@@ -1,4 +1,4 @@
-"""Claims with a heartbeat: who works on what, seen from other machines."""
+"""Leases with a heartbeat: who works on what, seen from other machines."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import time
 import pytest
 
 from irlcli.errors import Busy
-from irlcli.store import Store, claim, durable
+from irlcli.store import Store, durable, lease
 from irlcli.store import store as store_module
 
 KEY = "0" * 64
 
 
 def foreign(path, seconds_ago=0.0, host="another-node", machine="another", process=1):
-    """A claim as another machine writes it."""
+    """A lease as another machine writes it."""
     said = {"host": host, "machine": machine, "process": process, "token": "t"}
     path.write_text(json.dumps(said))
     os.utime(path, (time.time() - seconds_ago,) * 2)
@@ -29,7 +29,7 @@ def foreign(path, seconds_ago=0.0, host="another-node", machine="another", proce
 
 
 @pytest.fixture
-def claims(empty_store):
+def leases(empty_store):
     return empty_store.root / ".locks"
 
 
@@ -38,39 +38,39 @@ def work(store, **options):
         pass
 
 
-def test_another_machine_at_work_is_busy(empty_store, claims):
-    path = foreign(claims / f"{KEY}.claim")
+def test_another_machine_at_work_is_busy(empty_store, leases):
+    path = foreign(leases / f"{KEY}.claim")
     with pytest.raises(Busy, match="process 1 on another-node"):
         work(empty_store)
     path.unlink()
     work(empty_store)
 
 
-def test_a_claim_without_a_heartbeat_is_taken_over(empty_store, claims):
-    foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS - 10)
+def test_a_lease_without_a_heartbeat_is_taken_over(empty_store, leases):
+    foreign(leases / f"{KEY}.claim", lease.STALE_SECONDS - 10)
     with pytest.raises(Busy):
         work(empty_store)
-    foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS + 1)
+    foreign(leases / f"{KEY}.claim", lease.STALE_SECONDS + 1)
     with empty_store.working_on(KEY, wait=False):
-        holder = claim.read(claims / f"{KEY}.claim")
+        holder = lease.read(leases / f"{KEY}.claim")
         assert (holder.host, holder.process) == (os.uname().nodename, os.getpid())
-    assert claim.read(claims / f"{KEY}.claim") is None
+    assert lease.read(leases / f"{KEY}.claim") is None
 
 
-def test_a_dead_process_of_this_machine_is_replaced_at_once(empty_store, claims):
-    foreign(claims / f"{KEY}.claim", machine=durable.machine(), process=2**22 + 1)
+def test_a_dead_process_of_this_machine_is_replaced_at_once(empty_store, leases):
+    foreign(leases / f"{KEY}.claim", machine=durable.machine(), process=2**22 + 1)
     work(empty_store)
 
 
-def test_a_container_with_the_same_host_name_is_another_machine(empty_store, claims):
+def test_a_container_with_the_same_host_name_is_another_machine(empty_store, leases):
     """Its processes are not seen here."""
-    foreign(claims / f"{KEY}.claim", host=os.uname().nodename, process=2**22 + 1)
+    foreign(leases / f"{KEY}.claim", host=os.uname().nodename, process=2**22 + 1)
     with pytest.raises(Busy):
         work(empty_store)
 
 
-def test_what_other_machines_left_is_removed_after_a_day(empty_store, claims):
-    left = [claims / f".x.{2**22 + 1}.{i * 32}.{os.uname().nodename}-other" for i in "ab"]
+def test_what_other_machines_left_is_removed_after_a_day(empty_store, leases):
+    left = [leases / f".x.{2**22 + 1}.{i * 32}.{os.uname().nodename}-other" for i in "ab"]
     for path in left:
         path.touch()
     yesterday = time.time() - 90000.0
@@ -79,65 +79,65 @@ def test_what_other_machines_left_is_removed_after_a_day(empty_store, claims):
     assert [path.exists() for path in left] == [True, False]
 
 
-def test_waiting_ends_when_the_claim_ends(empty_store, claims, monkeypatch):
-    monkeypatch.setattr(claim, "_POLL_SECONDS", 0.01)
-    path = foreign(claims / f"{KEY}.claim")
+def test_waiting_ends_when_the_lease_ends(empty_store, leases, monkeypatch):
+    monkeypatch.setattr(lease, "_POLL_SECONDS", 0.01)
+    path = foreign(leases / f"{KEY}.claim")
     threading.Timer(0.1, path.unlink).start()
     waited_for = []
     work(empty_store, wait=True, on_wait=waited_for.append)
     assert waited_for == ["process 1 on another-node"]
 
 
-def test_a_claim_is_kept_alive(empty_store, claims, monkeypatch):
-    monkeypatch.setattr(claim, "HEARTBEAT_SECONDS", 0.02)
-    monkeypatch.setattr(claim, "_HEART", claim._Heart())
+def test_a_lease_is_kept_alive(empty_store, leases, monkeypatch):
+    monkeypatch.setattr(lease, "HEARTBEAT_SECONDS", 0.02)
+    monkeypatch.setattr(lease, "_HEART", lease._Heart())
     with empty_store.working_on(KEY, wait=False):
-        path = claims / f"{KEY}.claim"
+        path = leases / f"{KEY}.claim"
         os.utime(path, (0, 0))
         limit = time.monotonic() + 10
         while path.stat().st_mtime == 0 and time.monotonic() < limit:
             time.sleep(0.01)
-        assert claim.read(path).lives(locks_work=False)
+        assert lease.read(path).lives(locks_work=False)
 
 
-def test_whoever_lost_a_claim_leaves_the_new_one_alone(empty_store, claims):
+def test_whoever_lost_a_lease_leaves_the_new_one_alone(empty_store, leases):
     with empty_store.working_on(KEY, wait=False):
-        foreign(claims / f"{KEY}.claim")
-    assert claim.read(claims / f"{KEY}.claim").host == "another-node"
+        foreign(leases / f"{KEY}.claim")
+    assert lease.read(leases / f"{KEY}.claim").host == "another-node"
 
 
-def test_gc_waits_for_readers_of_other_machines_and_not_for_dead_ones(empty_store, claims):
-    reader = foreign(claims / ".reader.x")
+def test_gc_waits_for_readers_of_other_machines_and_not_for_dead_ones(empty_store, leases):
+    reader = foreign(leases / ".reader.x")
     with pytest.raises(Busy, match="another-node"):
         empty_store.collect(0.0)
-    foreign(reader, claim.STALE_SECONDS + 1)
+    foreign(reader, lease.STALE_SECONDS + 1)
     empty_store.collect(0.0)
-    assert not reader.exists() and list(claims.glob("*.claim")) == []
+    assert not reader.exists() and list(leases.glob("*.claim")) == []
 
 
-def test_readers_wait_for_gc_on_another_machine(empty_store, claims):
-    path = foreign(claims / "gc.claim")
+def test_readers_wait_for_gc_on_another_machine(empty_store, leases):
+    path = foreign(leases / "gc.claim")
     with pytest.raises(Busy, match="another-node"), empty_store.in_use():
         pass
-    foreign(path, claim.STALE_SECONDS + 1)
+    foreign(path, lease.STALE_SECONDS + 1)
     with empty_store.in_use():
         pass
 
 
-def test_gc_keeps_the_scratch_of_a_live_claim(empty_store, claims):
+def test_gc_keeps_the_scratch_of_a_live_lease(empty_store, leases):
     scratch = empty_store.root / ".work" / KEY
     scratch.mkdir()
-    foreign(claims / f"{KEY}.claim")
+    foreign(leases / f"{KEY}.claim")
     assert empty_store.collect(0.0) == ([], [])
-    foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS + 1)
+    foreign(leases / f"{KEY}.claim", lease.STALE_SECONDS + 1)
     assert empty_store.collect(0.0) == ([], [scratch])
-    assert list(claims.glob(f"{KEY}*")) == []
+    assert list(leases.glob(f"{KEY}*")) == []
 
 
-def test_a_claim_that_another_process_took_over_first_is_given_back(
-    empty_store, claims, monkeypatch
+def test_a_lease_that_another_process_took_over_first_is_given_back(
+    empty_store, leases, monkeypatch
 ):
-    path = foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS + 1)
+    path = foreign(leases / f"{KEY}.claim", lease.STALE_SECONDS + 1)
     rename = os.rename
 
     def late(source, target):
@@ -148,7 +148,7 @@ def test_a_claim_that_another_process_took_over_first_is_given_back(
     monkeypatch.setattr(os, "rename", late)
     with pytest.raises(Busy, match="another-node"):
         work(empty_store)
-    assert claim.read(path).token == "new"
+    assert lease.read(path).token == "new"
 
 
 @pytest.fixture
@@ -166,14 +166,14 @@ def no_locks(monkeypatch):
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
-def test_without_locks_claims_do_their_work(empty_store, publish, no_locks, claims, code):
+def test_without_locks_leases_do_their_work(empty_store, publish, no_locks, leases, code):
     no_locks(code)
     said = []
     store = Store(empty_store.root, said.append)
     publish(store)
     publish(store, parameters={"seed": 1})
     assert len(said) == 1 and os.strerror(code) in said[0]
-    # This process lives, so its claim holds here too.
+    # This process lives, so its lease holds here too.
     with store.working_on(KEY, wait=False), pytest.raises(Busy):
         work(store)
     with store.in_use(), pytest.raises(Busy):
@@ -181,36 +181,36 @@ def test_without_locks_claims_do_their_work(empty_store, publish, no_locks, clai
     store.collect(0.0)
 
 
-def test_a_link_is_no_claim(empty_store, claims, tmp_path):
+def test_a_link_is_no_lease(empty_store, leases, tmp_path):
     (tmp_path / "other").write_text("other")
-    (claims / f"{KEY}.claim").symlink_to(tmp_path / "other")
+    (leases / f"{KEY}.claim").symlink_to(tmp_path / "other")
     work(empty_store)
     assert (tmp_path / "other").read_text() == "other"
-    assert not os.path.lexists(claims / f"{KEY}.claim")
+    assert not os.path.lexists(leases / f"{KEY}.claim")
 
 
-def test_a_directory_is_no_claim(empty_store, claims):
+def test_a_directory_is_no_lease(empty_store, leases):
     for name in (f"{KEY}.claim", "gc.claim", ".reader.x"):
-        (claims / name).mkdir()
+        (leases / name).mkdir()
     with empty_store.in_use():
         work(empty_store)
     empty_store.collect(0.0)
-    assert not [path for path in claims.iterdir() if path.is_dir()]
+    assert not [path for path in leases.iterdir() if path.is_dir()]
 
 
 def test_a_full_disk_stops_no_reader(empty_store, monkeypatch):
     def full(path, *_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(claim, "open", full, raising=False)
-    monkeypatch.setattr(claim, "read", lambda path: None)
+    monkeypatch.setattr(lease, "open", full, raising=False)
+    monkeypatch.setattr(lease, "read", lambda path: None)
     with empty_store.in_use():
         pass
 
 
-def test_of_many_processes_one_takes_a_stale_claim_over(empty_store, claims):
-    """Without locks, so that the claim alone decides."""
-    foreign(claims / f"{KEY}.claim", claim.STALE_SECONDS + 1)
+def test_of_many_processes_one_takes_a_stale_lease_over(empty_store, leases):
+    """Without locks, so that the lease alone decides."""
+    foreign(leases / f"{KEY}.claim", lease.STALE_SECONDS + 1)
     code = (
         "import fcntl, sys, errno\n"
         "def flock(*_): raise OSError(errno.ENOLCK, '')\n"

@@ -1,6 +1,6 @@
-"""Claims: files with a heartbeat, which say across machines who works on what.
+"""Leases: files with a heartbeat, which say across machines who works on what.
 
-Some shared file systems lock for one machine only, or not at all. A claim is a file that its
+Some shared file systems lock for one machine only, or not at all. A lease is a file that its
 holder touches every :data:`HEARTBEAT_SECONDS`. One that was not touched for
 :data:`STALE_SECONDS` is taken over. A holder that was suspended for longer, and wakes up, does at
 most the same work twice. A reader that was suspended for longer may find that gc has deleted an old
@@ -23,16 +23,16 @@ from irlcli.errors import Busy
 from irlcli.store.durable import alive, machine, remove, unique_name
 
 HEARTBEAT_SECONDS = 20.0
-# NFS clients may show times that are 60 s old, so a live claim can look 80 s old.
+# NFS clients may show times that are 60 s old, so a live lease can look 80 s old.
 STALE_SECONDS = 120.0
 _POLL_SECONDS = 2.0
 _READER = ".reader"
 
 
 class Holder(NamedTuple):
-    """What the claim ``path`` says of its holder, and when it was touched [s].
+    """What the lease ``path`` says of its holder, and when it was touched [s].
 
-    A claim that cannot be read says nothing.
+    A lease that cannot be read says nothing.
     """
 
     path: Path
@@ -83,8 +83,8 @@ class Patience:
 
 
 @contextmanager
-def claimed(path: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
-    """Hold the claim ``path``. Call this while holding the lock of this machine, if it has locks.
+def leased(path: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
+    """Hold the lease ``path``. Call this while holding the lock of this machine, if it has locks.
 
     Without effect where the file cannot be written, for example on a full disk.
 
@@ -107,7 +107,7 @@ def claimed(path: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
 
 @contextmanager
 def reading(directory: Path, gc: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
-    """Keep the holder of the claim ``gc`` from starting, by a file of one's own in ``directory``.
+    """Keep the holder of the lease ``gc`` from starting, by a file of one's own in ``directory``.
 
     Raises:
         Busy: a live process holds ``gc``, and ``patience`` is not to wait.
@@ -136,14 +136,14 @@ def live_reader(directory: Path, locks_work: bool) -> Holder | None:
     return None
 
 
-def is_claimed(path: Path) -> bool:
-    """Whether a live process holds the claim ``path``."""
+def is_leased(path: Path) -> bool:
+    """Whether a live process holds the lease ``path``."""
     holder = read(path)
     return holder is not None and holder.lives(locks_work=False)
 
 
 def read(path: Path) -> Holder | None:
-    """The holder of a claim; None if nobody holds it."""
+    """The holder of a lease; None if nobody holds it."""
     try:
         # Opened and not only looked up, so that a file system of the network asks its server.
         with open(path, "rb", opener=_open) as file:
@@ -152,7 +152,7 @@ def read(path: Path) -> Holder | None:
     except FileNotFoundError:
         return None
     except OSError:
-        # A link or a directory, for example: no claim, and to be removed.
+        # A link or a directory, for example: no lease, and to be removed.
         return Holder(path, 0.0)
     try:
         said = json.loads(text)
@@ -186,14 +186,14 @@ def _now(directory: Path) -> float:
 
 
 def _create(path: Path, token: str) -> bool:
-    """Create the claim; False if it exists. True also where it cannot be written at all."""
+    """Create the lease; False if it exists. True also where it cannot be written at all."""
     said = {
         "host": os.uname().nodename,
         "machine": machine(),
         "process": os.getpid(),
         "token": token,
     }
-    # Linked when it is whole: the holder of an empty claim is unknown, and lives until it is stale.
+    # Linked when it is whole: the holder of an empty lease is unknown, and lives until it is stale.
     whole = path.with_name(unique_name(f".{path.name}"))
     try:
         with open(whole, "x") as file, suppress(OSError):
@@ -210,7 +210,7 @@ def _create(path: Path, token: str) -> bool:
 
 
 def _remove(path: Path, token: str) -> None:
-    """Remove the claim if it still holds ``token``; of several processes, one does."""
+    """Remove the lease if it still holds ``token``; of several processes, one does."""
     aside = path.with_name(unique_name(f".{path.name}"))
     try:
         os.rename(path, aside)
@@ -224,14 +224,14 @@ def _remove(path: Path, token: str) -> None:
 
 
 class _Heart:
-    """Touches the claims of this process, by a thread that starts with the first one."""
+    """Touches the leases of this process, by a thread that starts with the first one."""
 
     def __init__(self) -> None:
         self._tokens: dict[Path, str] = {}
         self._process = 0
 
     def add(self, path: Path, token: str) -> None:
-        # A forked child has no threads, and none of its parent's claims.
+        # A forked child has no threads, and none of its parent's leases.
         if self._process != os.getpid():
             self._process, self._tokens = os.getpid(), {}
             threading.Thread(target=self._beat, args=(self._tokens,), daemon=True).start()
