@@ -3,14 +3,14 @@
 from irlcli.cli import console as out
 from irlcli.cli.returns import number
 from irlcli.cli.session import StageSession
-from irlcli.data.descriptions import Demonstrations
+from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.requests.collect import summary
 from irlcli.stages.base import Request
 
 
 def deliver_demonstrations(
     session: StageSession, request: Request, name: str | None
-) -> Demonstrations | None:
+) -> DemonstrationSummary | None:
     """Run ``request``, and print a table beside its artefact. None with ``--dry-run``."""
     import msgspec
 
@@ -27,7 +27,7 @@ def deliver_demonstrations(
     return found
 
 
-def _print(found: Demonstrations) -> None:
+def _print(found: DemonstrationSummary) -> None:
     columns = ["demonstrations", "true return", "sd", "progress", "length", "episodes"]
     table = [
         [

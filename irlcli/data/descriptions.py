@@ -343,7 +343,7 @@ class CueContrast(Struct, frozen=True, kw_only=True):
     settings: Annotated[tuple[HintContrast, ...], Meta(min_length=1)]
 
 
-class Demonstrated(Struct, frozen=True, kw_only=True):
+class SettingSummary(Struct, frozen=True, kw_only=True):
     """The demonstrations of one setting. Imported ones may have no true reward."""
 
     setting: str
@@ -354,11 +354,11 @@ class Demonstrated(Struct, frozen=True, kw_only=True):
     mean_length: Finite
 
 
-class Demonstrations(Struct, frozen=True, kw_only=True):
+class DemonstrationSummary(Struct, frozen=True, kw_only=True):
     """``summary.json`` of collect-experts and import."""
 
     env: str
-    settings: tuple[Demonstrated, ...]
+    settings: tuple[SettingSummary, ...]
 
 
 class SettingQuality(Struct, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from irlcli.report.agents import title
 from irlcli.report.compute import points_of, whole_seeds
-from irlcli.report.drawing import panels, spread
+from irlcli.report.drawing import offsets, panels
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.statistics import holm, paired_p, summarise
 from irlcli.report.tables import Table
@@ -129,12 +129,12 @@ def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Ta
                 r.agent,
                 r.overrides or "as in settings/",
                 *(_setting(found, row, r.agent, setting) for setting in row.trained),
-                _spread(over_settings(found, row, r.agent, _RETRAINED)),
+                _by_seed(over_settings(found, row, r.agent, _RETRAINED)),
                 ", ".join(f"{getattr(r, _passed(gate))}/{r.seeds}" for gate in GATES)
                 if r.seeds
                 else "-",
                 percent(r.progress),
-                _spread(over_settings(found, row, r.agent, _STUDENT)),
+                _by_seed(over_settings(found, row, r.agent, _STUDENT)),
                 f"{100 * r.difference:+.1f} ({r.pairs})" if r.pairs else "-",
                 p_value(r.p_paired),
                 p_value(r.p_paired_holm),
@@ -152,10 +152,10 @@ def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Ta
 def _setting(found: pd.DataFrame, row: Row, variant: str, setting: str) -> str:
     chosen = points_of(found, row.name, variant, _RETRAINED)
     chosen = chosen[chosen["setting"] == setting]
-    return _spread(chosen.set_index("seed")["share"].sort_index().dropna())
+    return _by_seed(chosen.set_index("seed")["share"].sort_index().dropna())
 
 
-def _spread(values: pd.Series) -> str:
+def _by_seed(values: pd.Series) -> str:
     """``93 % ± 4 (89, 93, 97)``: mean, deviation, and each seed in order, in per cent."""
     s = summarise((100 * values).tolist())
     if s.mean is None:
@@ -211,7 +211,7 @@ def _panel(axis: Axes, p: Parameters, row: Row, found: pd.DataFrame) -> None:
             values = 100 * over_settings(found, row, variant.name, measure).to_numpy()
             n = len(values)
             axis.plot(
-                x + shift + spread(n, 0.1),
+                x + shift + offsets(n, 0.1),
                 values,
                 "o",
                 ms=4.5,

@@ -13,7 +13,7 @@ def panels(rows: int, columns: int, size: tuple[float, float], **shared: Any) ->
     return figure, figure.subplots(rows, columns, squeeze=False, **shared)
 
 
-def spread(count: int, reach: float) -> np.ndarray:
+def offsets(count: int, reach: float) -> np.ndarray:
     """``count`` offsets from -reach to reach, so that points beside each other can be told apart."""
     return np.linspace(-reach, reach, count) if count > 1 else np.zeros(count)
 

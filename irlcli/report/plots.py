@@ -18,7 +18,7 @@ from irlcli.report import ablation
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, colours, title
 from irlcli.report.build import Report
 from irlcli.report.compute import sample
-from irlcli.report.drawing import panels, save, spread
+from irlcli.report.drawing import offsets, panels, save
 from irlcli.report.parameters import Parameters, Row
 from irlcli.report.result_tables import paper_row
 
@@ -112,7 +112,7 @@ def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) ->
     for x, (method, colour) in enumerate(colours(p.methods).items()):
         values = sample(report.points, row.name, method, measure)["true_return"].to_numpy()
         axis.plot(
-            x + spread(len(values), 0.16), values, "o", ms=4.5, color=colour, alpha=0.6, mew=0
+            x + offsets(len(values), 0.16), values, "o", ms=4.5, color=colour, alpha=0.6, mew=0
         )
         cell = cells.loc[(method, measure)]
         if not pd.isna(cell["mean"]):

@@ -250,8 +250,8 @@ def reward_quality(found: pd.DataFrame) -> Table:
                 setting.partition("=")[2],
                 title(method),
                 str(len(seeds)),
-                _spread(seeds["spearman"]),
-                _spread(seeds["spearman_low"]),
+                _median_and_range(seeds["spearman"]),
+                _median_and_range(seeds["spearman_low"]),
                 number(seeds["expert_minus_idle"].astype(float).median(), 2),
                 *(
                     f"{verdicts.count(v)}/{len(verdicts)}" if verdicts else ""
@@ -265,7 +265,7 @@ def reward_quality(found: pd.DataFrame) -> Table:
     return Table(REWARD_QUALITY, _QUALITY_NOTE, columns, lines, heads=3)
 
 
-def _spread(values: pd.Series) -> str:
+def _median_and_range(values: pd.Series) -> str:
     """The median over seeds, and the range if it has one."""
     known = values.dropna().astype(float)
     if known.empty:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from irlcli.configs.load import field_of
-from irlcli.data.descriptions import Demonstrations
+from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
 from irlcli.experiments.references import output, recorded
@@ -59,12 +59,12 @@ def collect_experts(
     return collect_stage.request(env, settings, config, seed, counts, experts, trust, normalisers)
 
 
-def summary(session: StageSession, artefact: Artefact) -> Demonstrations:
+def summary(session: StageSession, artefact: Artefact) -> DemonstrationSummary:
     """What the demonstrations in ``artefact`` are worth, by setting."""
-    return output(session.store, artefact, "summary.json", Demonstrations)
+    return output(session.store, artefact, "summary.json", DemonstrationSummary)
 
 
-def missed_bars(session: StageSession, summary: Demonstrations) -> Iterator[str]:
+def missed_bars(session: StageSession, summary: DemonstrationSummary) -> Iterator[str]:
     """A warning for each expert whose mean true return is below the config's bar."""
     config = session.config(summary.env)
     for row in summary.settings:

@@ -185,7 +185,7 @@ def describing(place: Path) -> Target:
             _refused(descriptions.parse, value, form)
         for form in (descriptions.Dataset, descriptions.Evaluation):
             _refused(descriptions.parse, value, form)
-        for form in (descriptions.Quality, descriptions.Demonstrations):
+        for form in (descriptions.Quality, descriptions.DemonstrationSummary):
             _refused(descriptions.convert, value, form)
 
     return Target([json.dumps(seed).encode() for seed in seeds], read)

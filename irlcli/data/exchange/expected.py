@@ -16,7 +16,8 @@ from irlcli.errors import UsageError, first_line
 from irlcli.interventions import parse_setting, world
 from irlcli.trajectories import ActionSpace
 
-Place = Callable[[int], str]
+# From a row to where it stands in its source, for messages.
+Locate = Callable[[int], str]
 # What exports call the setting.
 SETTING = "setting"
 
@@ -110,7 +111,7 @@ def action_array(array: np.ndarray) -> np.ndarray:
         return array.astype(np.float32, copy=False)
 
 
-def numbers(column: pa.Array, name: str, place: Place) -> np.ndarray:
+def numbers(column: pa.Array, name: str, place: Locate) -> np.ndarray:
     """A column of B numbers, or of lists of equal length, as an array [B] or [B, ...].
 
     Raises:
@@ -146,7 +147,7 @@ def numbers(column: pa.Array, name: str, place: Place) -> np.ndarray:
     return inner.reshape(len(column), size, *inner.shape[1:])
 
 
-def require_all(column: pa.Array, name: str, place: Place) -> None:
+def require_all(column: pa.Array, name: str, place: Locate) -> None:
     """Refuse a column with a null.
 
     Raises:

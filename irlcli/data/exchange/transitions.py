@@ -16,7 +16,7 @@ from irlcli.data.demonstrations import action_type, array_column, table_schema
 from irlcli.data.exchange.expected import (
     SETTING,
     Expected,
-    Place,
+    Locate,
     action_array,
     numbers,
     require_all,
@@ -115,7 +115,7 @@ def _steps(
     )
 
 
-def _settings(batch: pa.RecordBatch, expected: Expected, place: Place) -> np.ndarray:
+def _settings(batch: pa.RecordBatch, expected: Expected, place: Locate) -> np.ndarray:
     if expected.column is None:
         if SETTING in batch.schema.names:
             _check_settings(batch.column(SETTING), expected, place)
@@ -141,7 +141,7 @@ def _text(name: pa.Scalar) -> str:
     return str(name.as_py() if narrow is None else narrow(name.as_py()))
 
 
-def _check_settings(column: pa.Array, expected: Expected, place: Place) -> None:
+def _check_settings(column: pa.Array, expected: Expected, place: Locate) -> None:
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
         for name in pc.unique(column).to_pylist():
@@ -158,7 +158,7 @@ class _EpisodeStarts:
         self._last: Any = None
         self._ended = True
 
-    def of(self, named: pa.Array | None, ended: np.ndarray, place: Place) -> np.ndarray:
+    def of(self, named: pa.Array | None, ended: np.ndarray, place: Locate) -> np.ndarray:
         """[B] bool for a batch whose episodes are ``named`` and end where ``ended``."""
         if named is None:
             first = np.append(self._ended, ended[:-1])
