@@ -25,7 +25,7 @@ from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError, first_line
 from irlcli.interventions import parse_setting
 
-# Of a dataset: every episode is validated on its own when demonstrations are read.
+# In a dataset: reading demonstrations validates each episode by itself.
 MOST_EPISODES = 100_000
 Size = Annotated[int, Meta(ge=1, le=4096)]
 Settings = Annotated[tuple[str, ...], Meta(min_length=1)]

@@ -71,8 +71,8 @@ def batches(
 ) -> Iterator[pa.RecordBatch]:
     """The rows of ``file``, at most ``size`` at a time.
 
-    Memory is bounded by a row group: Arrow keeps what it decoded of all the row groups that it was
-    asked for, so small ones only are asked for together.
+    Arrow keeps all row groups of one request in memory. So row groups are requested together only
+    until they hold ``size`` rows.
     """
     chosen: list[int] = []
     rows = 0

@@ -34,7 +34,14 @@ from irlcli.interventions import Setting
 
 
 class Written(NamedTuple):
-    """The episodes of a written dataset: setting index, length, and return; NaN if unknown."""
+    """The episodes of a written dataset.
+
+    Attributes:
+        settings: index of the setting, by episode.
+        lengths: number of steps, by episode.
+        returns: sum of the true rewards, by episode; NaN if unknown.
+        rewarded: whether the true rewards are known.
+    """
 
     settings: np.ndarray
     lengths: np.ndarray

@@ -56,7 +56,10 @@ def to_bytes(value: Any) -> bytes:
 
 
 def json_tensor(value: Any) -> torch.Tensor:
-    """``value`` as one tensor uint8: rows grow with the rounds, the number of tensors does not."""
+    """The JSON of ``value`` in one uint8 tensor.
+
+    So the number of tensors in a checkpoint does not grow with the rounds.
+    """
     return torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
 
 
@@ -121,10 +124,10 @@ def restore(data: bytes | None, names: set[str], discard: Callable[[str], None])
 
 @contextmanager
 def fitting(directory: Path) -> Iterator[None]:
-    """Report errors as a checkpoint in the scratch ``directory`` that does not fit its stage.
+    """Restore the checkpoint in the scratch ``directory``; an error means that it does not fit.
 
     Raises:
-        IntegrityError: instead of most errors: a crafted state can make torch and Python raise all.
+        IntegrityError: instead of any other error. A crafted state can make torch raise anything.
         MemoryError, IrlError: as raised; they prove nothing about the checkpoint.
     """
     try:

@@ -10,10 +10,11 @@ Most functions take *points*: a row per evaluation and setting with the columns
     expert_of     the setting in which an expert was trained
     setting       the setting of the evaluation
     true_return, progress, learned_return
-                  means over episodes; progress may be missing. The learned return is under the
-                  ceiling of the retrained policy, and of it and of the expert by its reward only
+                  means over episodes. Progress may be missing. The learned return is known only
+                  of retrained policies, and of the expert scored by their reward; both are under
+                  the policy's ceiling
     true_error, learned_error
-                  standard errors of those means; missing where the learned return is
+                  standard errors of those means, known where a learned return may be
     episodes      their number
     evaluation    id of the artefact
 """

@@ -1,4 +1,4 @@
-"""Figures without pyplot: the backend that it would choose belongs to the caller, a notebook say."""
+"""Figures made without pyplot, which would change the caller's backend (a notebook's, say)."""
 
 from pathlib import Path
 from typing import Any

@@ -103,9 +103,9 @@ class Remote:
         return self._index
 
     def manifests(self, id16: str) -> Index:
-        """An artefact and all that its provenance names, so that not every manifest is fetched.
+        """``id16`` and the ancestors that provenance names, so that few manifests are fetched.
 
-        If that does not lead to every input, all artefacts.
+        If an input is not found that way, all artefacts.
         """
         if self._index is not None and id16 in self._index.artefacts:
             return self._index

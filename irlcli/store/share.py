@@ -52,7 +52,8 @@ def share(
 
     Args:
         warn: receives what is missing of the lineage.
-        start: receives the number of artefacts and bytes to copy; returns what counts the bytes.
+        start: called once with the number of artefacts and of bytes to copy. It returns a function
+            that is called with the size of each chunk.
         partial: skip, with a warning, artefacts that were made from a damaged one, instead of
             raising.
 

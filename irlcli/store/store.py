@@ -237,7 +237,10 @@ class Store:
     # Copying, as a Remote does
 
     def manifests(self, id16: str) -> Index:
-        """The sound manifests, read once: again only for an artefact that is newer than that."""
+        """The artefacts with sound manifests.
+
+        They are read once, and again if ``id16`` is not among them.
+        """
         if self._index is None or id16 not in self._index.artefacts:
             self._index = read.index(self._layout._replace(read_only=True), self.warn)
         return self._index
