@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -18,22 +18,13 @@ from irlcli.interventions import Setting
 from irlcli.rl.policy import Policy, require_observations
 from irlcli.trajectories import Trajectory
 
+if TYPE_CHECKING:
+    from irlcli.learners.frozen import FrozenReward
+
 PANEL = (320, 240)
 # Two lines. With them a frame is a multiple of 16 pixels high, as video codecs want it.
 _CAPTION = 32
 _FRAMES_PER_SECOND = 20
-
-
-class Score(Protocol):
-    """A learned reward, see :class:`irlcli.learners.frozen.FrozenReward`."""
-
-    def of_transitions(
-        self, observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray
-    ) -> np.ndarray:
-        """The reward [B] of single steps."""
-
-    def of_episode(self, trajectory: Trajectory) -> float:
-        """The learned return of a whole episode."""
 
 
 class Film(NamedTuple):
@@ -50,7 +41,7 @@ def film(
     settings: Sequence[Setting],
     steps: int,
     seed: int,
-    rewards: Sequence[Score] | None = None,
+    rewards: Sequence[FrozenReward] | None = None,
 ) -> Film:
     """One episode of ``policy`` in each setting, all from ``seed``, in real time.
 
@@ -148,7 +139,7 @@ def _panels(
     limit: int,
     stride: int,
     seed: int,
-    score: Score | None,
+    score: FrozenReward | None,
 ) -> Iterator[Image.Image]:
     """A panel for every ``stride``-th step of one episode, and one for its end."""
     observation, _ = world.reset(seed=seed)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
+
+from irlcli.trajectories import Transitions
 
 # Transitions that are compared, and (action, state) pairs behind each expectation. At these sizes
 # the distance had a standard deviation of 0.005 between seeds (Reacher, two rewards).
@@ -17,21 +19,7 @@ _PAIRS = 200
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-class Coverage(NamedTuple):
-    """The transitions under which rewards are compared: (s, a, s') [B, ...]."""
-
-    observations: np.ndarray
-    actions: np.ndarray
-    next_observations: np.ndarray
-
-    def drawn(self, count: int, rng: np.random.Generator) -> Coverage:
-        """``count`` of the transitions at random, or all if there are not more."""
-        size = len(self.actions)
-        rows = rng.choice(size, min(count, size), replace=False)
-        return Coverage(*(part[rows] for part in self))
-
-
-def canonical(reward: Reward, of: Coverage, pairs: Coverage, discount: float) -> np.ndarray:
+def canonical(reward: Reward, of: Transitions, pairs: Transitions, discount: float) -> np.ndarray:
     """The canonically shaped reward [B] of the transitions ``of``, up to a constant (Def. 4.1).
 
     R(s, a, s') + E[gamma R(s', A, S') - R(s, A, S')]. The constant term gamma E[R(S, A, S')] does
@@ -41,18 +29,18 @@ def canonical(reward: Reward, of: Coverage, pairs: Coverage, discount: float) ->
 
     def expected(states: np.ndarray) -> np.ndarray:
         total = np.zeros(len(states))
-        for k in range(len(pairs.actions)):
+        for k in range(len(pairs)):
             action = np.repeat(pairs.actions[k : k + 1], len(states), axis=0)
             successor = np.repeat(pairs.next_observations[k : k + 1], len(states), axis=0)
             total += reward(states, action, successor)
-        return total / len(pairs.actions)
+        return total / len(pairs)
 
-    here = reward(*of)
+    here = reward(of.observations, of.actions, of.next_observations)
     return here + discount * expected(of.next_observations) - expected(of.observations)
 
 
 def epic_distance(
-    true: Reward, learned: Reward, coverage: Coverage, discount: float
+    true: Reward, learned: Reward, coverage: Transitions, discount: float
 ) -> float | None:
     """sqrt((1 - r) / 2), r Pearson's between the canonical rewards over ``coverage`` (Def. 4.4).
 
@@ -60,11 +48,16 @@ def epic_distance(
     reward is constant.
     """
     rng = np.random.default_rng(0)
-    of, pairs = coverage.drawn(_TRANSITIONS, rng), coverage.drawn(_PAIRS, rng)
-    pairs = pairs._replace(next_observations=rng.permutation(pairs.next_observations))
+    of, pairs = _drawn(coverage, _TRANSITIONS, rng), _drawn(coverage, _PAIRS, rng)
+    pairs = replace(pairs, next_observations=rng.permutation(pairs.next_observations))
     shaped = [canonical(reward, of, pairs, discount) for reward in (true, learned)]
     # A constant reward leaves rounding errors only.
     if any(np.ptp(values) <= 1e-9 * max(1.0, np.abs(values).max()) for values in shaped):
         return None
     r = float(np.corrcoef(shaped[0], shaped[1])[0, 1])
     return math.sqrt(max(0.0, 1.0 - r) / 2.0)
+
+
+def _drawn(data: Transitions, count: int, rng: np.random.Generator) -> Transitions:
+    """``count`` of the transitions at random, or all if there are not more."""
+    return data.take(rng.choice(len(data), min(count, len(data)), replace=False))

@@ -177,7 +177,7 @@ def _epic_distances(
     Without a true reward of transitions none, and the reason.
     """
     from irlcli.envs.registration import transition_reward
-    from irlcli.report.epic import Coverage, epic_distance
+    from irlcli.report.epic import epic_distance
     from irlcli.trajectories import transitions
 
     true = transition_reward(where.name)
@@ -191,9 +191,8 @@ def _epic_distances(
         here = {entry.kind: group for entry, group in episodes.items() if entry.setting == place}
         good = here.get("expert", here.get("student", ()))
         data = transitions([*here["random"], *good], where.max_episode_steps)
-        coverage = Coverage(data.observations, data.actions, data.next_observations)
         learned = frozen_reward(where, place, model, origin).of_transitions
-        found[place] = epic_distance(true, learned, coverage, origin.network.gamma)
+        found[place] = epic_distance(true, learned, data, origin.network.gamma)
     return found, ""
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from irlcli.report.epic import Coverage, canonical, epic_distance
+from irlcli.report.epic import canonical, epic_distance
+from irlcli.trajectories import Transitions
 
 DISCOUNT = 0.9
 
@@ -11,7 +12,8 @@ DISCOUNT = 0.9
 @pytest.fixture
 def coverage():
     rng = np.random.default_rng(0)
-    return Coverage(*rng.normal(size=(3, 400, 2)))
+    steps = rng.normal(size=(3, 400, 2))
+    return Transitions(*steps, terminated=np.zeros(400, bool), remaining=np.zeros(400, int))
 
 
 def task(s, a, s_next):
