@@ -5,7 +5,6 @@ Only its Arrow files are read. The column ``infos`` holds pickles in JSON, which
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,10 +21,10 @@ from irlcli.data.exchange.expected import (
 from irlcli.data.parquet import UNREADABLE
 from irlcli.data.steps import PIECE, Steps
 from irlcli.errors import IntegrityError, UsageError
+from irlcli.store import read_json
 
 STATE = "state.json"
 _COLUMNS = ("obs", "acts", "terminal")
-_MAX_STATE_BYTES = 16 << 20
 
 
 def read_imitation(directory: Path, expected: Expected, size: int = PIECE) -> Iterator[Steps]:
@@ -46,17 +45,14 @@ def read_imitation(directory: Path, expected: Expected, size: int = PIECE) -> It
                     batch.validate(full=True)
                     yield from _episodes(directory, batch, done, expected, size)
                     done += batch.num_rows
-    except UNREADABLE as error:
+    except (*UNREADABLE, IntegrityError) as error:
         raise IntegrityError(
             unreadable(directory, error), "name a directory that imitation's serialize.save wrote"
         ) from None
 
 
 def _data_files(directory: Path) -> list[Path]:
-    path = directory / STATE
-    if not path.is_file() or path.stat().st_size > _MAX_STATE_BYTES:
-        raise ValueError(f"it has no {STATE}")
-    names = [entry["filename"] for entry in json.loads(path.read_bytes())["_data_files"]]
+    names = [entry["filename"] for entry in read_json(directory / STATE)["_data_files"]]
     for name in names:
         if not isinstance(name, str) or Path(name).name != name:
             raise ValueError(f"{STATE} names a file outside the directory")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,8 +21,8 @@ from irlcli.data.steps import PIECE, Steps, episodes
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, StageFailed, UsageError
 from irlcli.interventions import Setting
+from irlcli.store import read_json
 
-_MAX_METADATA_BYTES = 16 << 20
 _ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
@@ -299,11 +298,8 @@ def _open(directory: Path) -> Any:
     storage_class = _storage_class()
     from minari.dataset.minari_storage import is_image_space
 
-    path = directory / "metadata.json"
     try:
-        if path.stat().st_size > _MAX_METADATA_BYTES:
-            raise ValueError("metadata.json is too large")
-        metadata = json.loads(path.read_bytes())
+        metadata = read_json(directory / "metadata.json")
         # Without them Minari would make the environment that the metadata name: it runs code.
         if not {"observation_space", "action_space"} <= set(metadata):
             raise ValueError("its metadata describe no spaces")
