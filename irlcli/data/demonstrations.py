@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from irlcli.data.parquet import UNREADABLE, open_table, write_table, writer
+from irlcli.data.parquet import UNREADABLE, open_table
 from irlcli.errors import IntegrityError, NewerFormat, first_line
 from irlcli.interventions import MAX_SETTING_LENGTH, Setting
 from irlcli.trajectories import Trajectory
@@ -51,34 +51,6 @@ class Demonstrations:
                 f"the demonstrations are of {self.env} {', '.join(self.trajectories)}, but "
                 f"{env} {', '.join(settings)} is asked for"
             )
-
-
-def write_demonstrations(
-    directory: Path,
-    env: str,
-    groups: Sequence[tuple[Setting, Sequence[Trajectory]]],
-    metadata: Mapping[str, Any],
-) -> None:
-    """Write ``groups`` of trajectories into ``directory``.
-
-    Raises:
-        OSError: the directory cannot be written.
-        ValueError: no trajectory, or trajectories of different shapes.
-    """
-    episodes = [(setting, trajectory) for setting, group in groups for trajectory in group]
-    if not episodes:
-        raise ValueError("no trajectory to write")
-    first = episodes[0][1]
-    size = first.observations.shape[1]
-    schema = steps_schema(size, action_type(first.actions))
-    tags = file_metadata(env, metadata, schema)
-    schema = schema.with_metadata(tags)
-    with writer(directory / STEPS, schema) as file:
-        for index, (_, trajectory) in enumerate(episodes):
-            file.write_table(_steps_table(schema, index, trajectory), row_group_size=2**30)
-    rows = [_episode_row(i, setting, t) for i, (setting, t) in enumerate(episodes)]
-    schema = episodes_schema(size).with_metadata(tags)
-    write_table(pa.Table.from_pylist(rows, schema=schema), directory / EPISODES)
 
 
 def file_metadata(env: str, metadata: Mapping[str, Any], steps: pa.Schema) -> dict[bytes, bytes]:
@@ -127,32 +99,6 @@ def episodes_schema(
 def table_schema(**columns: pa.DataType) -> pa.Schema:
     """``columns`` by name, none of which holds nulls."""
     return pa.schema([pa.field(name, kind, nullable=False) for name, kind in columns.items()])
-
-
-def _steps_table(schema: pa.Schema, index: int, trajectory: Trajectory) -> pa.Table:
-    steps = len(trajectory)
-    columns = (
-        np.full(steps, index, dtype=np.int32),
-        np.arange(steps, dtype=np.int32),
-        trajectory.observations[:-1],
-        trajectory.actions,
-        trajectory.rewards,
-    )
-    return pa.Table.from_arrays([array_column(array) for array in columns], schema=schema)
-
-
-def _episode_row(index: int, setting: Setting, trajectory: Trajectory) -> dict[str, Any]:
-    return {
-        "episode": index,
-        "setting": str(setting),
-        "intervention": intervention_numbers(setting),
-        "seed": trajectory.seed,
-        "length": len(trajectory),
-        "return": trajectory.episode_return,
-        "terminated": trajectory.terminated,
-        "truncated": trajectory.truncated,
-        "final_obs": trajectory.observations[-1],
-    }
 
 
 def intervention_numbers(setting: Setting) -> list[float]:

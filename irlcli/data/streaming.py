@@ -28,9 +28,10 @@ from irlcli.data.demonstrations import (
 )
 from irlcli.data.descriptions import MOST_EPISODES
 from irlcli.data.parquet import batches, write_table, writer
-from irlcli.data.steps import PIECE, Steps, mixed_rewards, pieces
+from irlcli.data.steps import PIECE, Steps, mixed_rewards, nowhere, pieces
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting
+from irlcli.trajectories import Trajectory
 
 
 class Written(NamedTuple):
@@ -65,8 +66,56 @@ def write_stream(
         OSError: the directory cannot be written.
         UsageError: no step, too many episodes, or a true reward that only some steps have.
     """
-    stream = pieces(parts, size)
-    first = next(stream, None)
+    # The numbers of an import rarely repeat.
+    return _write(directory, env, settings, pieces(parts, size), metadata, repeating=())
+
+
+def write_demonstrations(
+    directory: Path,
+    env: str,
+    groups: Sequence[tuple[Setting, Sequence[Trajectory]]],
+    metadata: Mapping[str, Any],
+) -> None:
+    """Write ``groups`` of trajectories as a dataset, with a row group for each episode.
+
+    Raises:
+        OSError: the directory cannot be written.
+        ValueError: no trajectory, or trajectories of different shapes.
+    """
+    settings = [setting for setting, _ in groups]
+    episodes = [(index, t) for index, (_, group) in enumerate(groups) for t in group]
+    if not episodes:
+        raise ValueError("no trajectory to write")
+    _write(directory, env, settings, itertools.starmap(_steps, episodes), metadata, repeating=None)
+
+
+def _steps(setting: int, trajectory: Trajectory) -> Steps:
+    t = np.arange(len(trajectory))
+    last = t == len(t) - 1
+    return Steps(
+        first=t == 0,
+        settings=np.full(len(t), setting),
+        observations=trajectory.observations[:-1],
+        actions=trajectory.actions,
+        rewards=trajectory.rewards,
+        next_observations=trajectory.observations[1:],
+        terminated=last & trajectory.terminated,
+        truncated=last & trajectory.truncated,
+        seeds=np.full(len(t), trajectory.seed),
+        place=nowhere,
+    )
+
+
+def _write(
+    directory: Path,
+    env: str,
+    settings: Sequence[Setting],
+    parts: Iterator[Steps],
+    metadata: Mapping[str, Any],
+    repeating: Sequence[str] | None,
+) -> Written:
+    """Write each of ``parts`` as a row group; ``repeating`` as for :func:`writer`."""
+    first = next(parts, None)
     if first is None:
         raise UsageError("the recordings hold no episode", "name recordings with episodes")
     width, rewarded = first.observations.shape[1], first.rewards is not None
@@ -74,9 +123,9 @@ def write_stream(
     tags = file_metadata(env, metadata, schema)
     schema = schema.with_metadata(tags)
     table = _EpisodeTable(width, rewarded)
-    with writer(directory / STEPS, schema, repeating=()) as file:
-        for piece in itertools.chain([first], stream):
-            file.write_table(table.add(schema, piece), row_group_size=max(1, len(piece)))
+    with writer(directory / STEPS, schema, repeating) as file:
+        for part in itertools.chain([first], parts):
+            file.write_table(table.add(schema, part), row_group_size=max(1, len(part)))
     rows = table.rows(settings, episodes_schema(width, rewarded=rewarded).with_metadata(tags))
     write_table(rows, directory / EPISODES)
     return table.written()

@@ -191,8 +191,8 @@ def run_tabular(job: Job) -> None:
 
 def _record(job: Job, found: Iterable[list[Trajectory]], metadata: Mapping[str, Any]) -> None:
     """Write the demonstrations of each setting as they are made."""
-    from irlcli.data.demonstrations import write_demonstrations
     from irlcli.data.outputs import write_json
+    from irlcli.data.streaming import write_demonstrations
 
     p: Parameters | TabularParameters = job.parameters
     groups, summary = [], []

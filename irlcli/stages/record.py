@@ -76,8 +76,8 @@ def request(
 
 def run(job: Job) -> None:
     """Roll out; episode k starts from the same state as episode k of an evaluation."""
-    from irlcli.data.demonstrations import write_demonstrations
     from irlcli.data.outputs import write_json
+    from irlcli.data.streaming import write_demonstrations
     from irlcli.data.tensors import load_policy_file
 
     p: Parameters = job.parameters

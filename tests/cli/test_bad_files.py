@@ -20,7 +20,8 @@ from answers import IRL, Done, arguments, assert_answered, halve, snapshot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.streaming import write_demonstrations
 from irlcli.envs.registry import environment
 from irlcli.errors import IrlError
 from irlcli.experiments import provenance

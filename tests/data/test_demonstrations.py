@@ -15,8 +15,8 @@ from irlcli.data.demonstrations import (
     STEPS,
     read_demonstrations,
     read_metadata,
-    write_demonstrations,
 )
+from irlcli.data.streaming import write_demonstrations
 from irlcli.errors import IntegrityError
 from irlcli.interventions import parse_settings
 from irlcli.trajectories import Trajectory

@@ -11,7 +11,8 @@ import pytest
 import torch
 from airl_runs import CONFIG, LANDER, SETTINGS, make, random_episodes
 
-from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
+from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.streaming import write_demonstrations
 from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.errors import StageFailed
 from irlcli.experiments.runner import Silent

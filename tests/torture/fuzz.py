@@ -202,7 +202,8 @@ def _demonstrations(place: Path, changed: str) -> Target:
     import numpy as np
     import pyarrow.parquet as pq
 
-    from irlcli.data.demonstrations import read_demonstrations, write_demonstrations
+    from irlcli.data.demonstrations import read_demonstrations
+    from irlcli.data.streaming import write_demonstrations
     from irlcli.interventions import parse_settings
     from irlcli.trajectories import Trajectory
 
