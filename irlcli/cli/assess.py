@@ -69,19 +69,14 @@ def assess(
 
 def print_assessment(assessment: Assessment) -> None:
     """The bank, the correlations and the regret splits, as tables on stderr."""
-    rows: list[list[str]] = []
-    progress: list[str] = []
-    for s in assessment.settings:
-        here = [e for e in assessment.bank if e.setting == s.setting]
-        for e in sorted(here, key=lambda e: e.true.mean):
-            rows.append([e.setting, e.policy, _measured(e.true), _measured(e.learned)])
-            progress.append("-" if e.progress is None else f"{e.progress:.1f}")
-    columns = ["setting", "policy", "true return", "learned return"]
-    if any(e.progress is not None for e in assessment.bank):
-        columns.insert(3, "progress")
-        for row, text in zip(rows, progress, strict=True):
-            row.insert(3, text)
-    out.print_table(columns, rows, stderr=True)
+    rows = [
+        [e.setting, e.policy, _measured(e.true), out.number(e.progress), _measured(e.learned)]
+        for s in assessment.settings
+        for e in sorted(assessment.bank, key=lambda e: e.true.mean)
+        if e.setting == s.setting
+    ]
+    columns = ["setting", "policy", "true return", "progress", "learned return"]
+    out.print_table(columns, rows, stderr=True, optional=("progress",))
     ranked = ["policies", "Spearman", "Pearson"]
     columns = ["setting", *ranked, *(f"{name}, lower half" for name in ranked)]
     columns += ["expert - idle", "return distance", "EPIC"]
@@ -129,8 +124,7 @@ def _ranked(found: Assessed) -> list[str]:
         cells += [str(part.policies), _interval(part.spearman), _interval(part.pearson)]
     gap = found.expert_minus_idle
     cells.append("-" if gap is None else _measured(gap, 3))
-    distances = (found.return_distance, found.epic)
-    return [*cells, *("-" if d is None else f"{d:.2f}" for d in distances)]
+    return [*cells, out.number(found.return_distance, 2), out.number(found.epic, 2)]
 
 
 def _interval(found: Interval | None) -> str:

@@ -225,15 +225,32 @@ def print_json(kind: str, value: Mapping[str, Any]) -> None:
     print_data(json.dumps({"version": JSON_VERSION, "kind": kind, **value}, sort_keys=True))
 
 
+def number(value: float | None, digits: int = 1) -> str:
+    """``value`` as a table shows it."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
 def print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "", stderr: bool = False
+    columns: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    title: str = "",
+    stderr: bool = False,
+    optional: Sequence[str] = (),
 ) -> None:
     """A table; plain text with aligned columns if the stream is not a terminal.
+
+    Of the columns ``optional``, those are left out in which every cell is ``-``.
 
     On a terminal cells are wrapped between words. Where the words are too wide, each row becomes a
     block of lines: no number, id or name is ever cut.
     """
     stream = sys.stderr if stderr else sys.stdout
+    shown = [
+        i
+        for i, column in enumerate(columns)
+        if column not in optional or any(row[i] != "-" for row in rows)
+    ]
+    columns, rows = [columns[i] for i in shown], [[row[i] for i in shown] for row in rows]
     title, *columns = (printable(text) for text in (title, *columns))
     rows = [[printable(str(cell)) for cell in row] for row in rows]
     if not stream.isatty():

@@ -1,7 +1,6 @@
 """Demonstrations that a command made: what they are worth, by setting."""
 
-from irlcli.cli import console as out
-from irlcli.cli.returns import number
+from irlcli.cli.console import number, print_table
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.requests.collect import summary
@@ -40,8 +39,4 @@ def _print(found: DemonstrationSummary) -> None:
         ]
         for row in found.settings
     ]
-    if all(row.mean_progress is None for row in found.settings):
-        del columns[3]
-        for cells in table:
-            del cells[3]
-    out.print_table(columns, table, stderr=True)
+    print_table(columns, table, stderr=True, optional=("progress",))

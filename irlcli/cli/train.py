@@ -128,7 +128,7 @@ def _print_quality(session: StageSession, artefact: Any) -> None:
     rows = [
         [
             row.setting + ("" if row.seen else " (unseen)"),
-            *("-" if getattr(row, m) is None else f"{getattr(row, m):.2f}" for m in measures),
+            *(out.number(getattr(row, m), 2) for m in measures),
             f"{row.log_likelihood:.1f}",
         ]
         for row in quality.settings
