@@ -6,7 +6,7 @@ an exit status. Every other exception that reaches the command line is a bug.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 RETRY = "No partial output was written. Fix the problem and run the same command again."
@@ -20,11 +20,11 @@ class IrlError(Exception):
 
     exit_code = 1
 
-    def __init__(self, message: str, hint: str = ""):
+    def __init__(self, message: str, hint: str = "", details: Mapping[str, object] | None = None):
         super().__init__(message)
         self.message = message
         self.hint = hint
-        self.details: dict[str, object] = {}
+        self.details = details or {}
 
     def __str__(self) -> str:
         return f"{self.message}\nhint: {self.hint}" if self.hint else self.message
@@ -53,8 +53,13 @@ class IntegrityError(IrlError):
 
     exit_code = 4
 
-    def __init__(self, message: str, hint: str = "recompute it, or choose another one"):
-        super().__init__(message, hint)
+    def __init__(
+        self,
+        message: str,
+        hint: str = "recompute it, or choose another one",
+        details: Mapping[str, object] | None = None,
+    ):
+        super().__init__(message, hint, details)
 
 
 class NewerFormat(IntegrityError):

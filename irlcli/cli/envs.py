@@ -145,13 +145,12 @@ def _check(session: Session, spec: EnvironmentSpec, config: Config) -> None:
     if session.as_json and not failed:
         out.print_json("check", {"environment": spec.name, "checks": _as_json(outcomes)})
     if failed:
-        error = StageFailed(
+        raise StageFailed(
             f"{len(failed)} of {len(outcomes)} checks of {spec.name} failed: "
             f"{failed[0].what}: {failed[0].wrong}",
             "docs/own-environments.md and docs/extending.md say what is expected",
+            {"checks": _as_json(outcomes)},
         )
-        error.details = {"checks": _as_json(outcomes)}
-        raise error
 
 
 def _as_json(outcomes: Sequence[Any]) -> list[dict[str, Any]]:

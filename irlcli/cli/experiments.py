@@ -369,10 +369,10 @@ def _raise_for(outcome: "Outcome", plan: "Plan", continue_hint: str) -> None:
         error = StageFailed(
             f"{len(outcome.failed)} of {total} steps failed: {names}{waiting}",
             again if outcome.exit_code in (75, 130) else f"fix the problem and {again}",
+            {
+                "failed": {name: failure._asdict() for name, failure in outcome.failed.items()},
+                "blocked": outcome.blocked,
+            },
         )
-        error.details = {
-            "failed": {name: failure._asdict() for name, failure in outcome.failed.items()},
-            "blocked": outcome.blocked,
-        }
     error.exit_code = outcome.exit_code
     raise error

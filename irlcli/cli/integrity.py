@@ -57,12 +57,10 @@ def verify(
             _print_command(id16, damage.command)
         moved = all(damage.place is not None for damage in damaged.values())
         state = "were damaged and are now in quarantine" if moved else "are damaged"
-        raise _with_details(
-            IntegrityError(
-                f"{len(damaged)} of {checked} artefacts {state}: {', '.join(damaged)}",
-                "run the commands above again to recompute them; with `--from STORE` they copy what "
-                "another store holds",
-            ),
+        raise IntegrityError(
+            f"{len(damaged)} of {checked} artefacts {state}: {', '.join(damaged)}",
+            "run the commands above again to recompute them; with `--from STORE` they copy what "
+            "another store holds",
             result,
         )
     if ref is None:
@@ -77,11 +75,9 @@ def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> No
     """Fail if a name points to nothing; warn if only an ancestor of a named artefact is missing."""
     result["damaged_names"] = session.store.damaged_names()
     if result["damaged_names"]:
-        raise _with_details(
-            IntegrityError(
-                f"damaged names: {', '.join(result['damaged_names'])}",
-                "name the artefacts again: `irl name REF NAME`",
-            ),
+        raise IntegrityError(
+            f"damaged names: {', '.join(result['damaged_names'])}",
+            "name the artefacts again: `irl name REF NAME`",
             result,
         )
     missing = session.store.missing(index)
@@ -97,13 +93,11 @@ def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> No
             session.console.warn(lost.text(id16))
     names = sorted(name for lost in missing.values() for name in lost.names)
     if names:
-        raise _with_details(
-            IntegrityError(
-                f"{len(names)} of {len(session.store.names())} names point to nothing: "
-                f"{', '.join(names)}",
-                "run the command that made the artefact again with the same --name, or give the "
-                "name to another artefact (irl name REF NAME)",
-            ),
+        raise IntegrityError(
+            f"{len(names)} of {len(session.store.names())} names point to nothing: "
+            f"{', '.join(names)}",
+            "run the command that made the artefact again with the same --name, or give the "
+            "name to another artefact (irl name REF NAME)",
             result,
         )
 
@@ -111,11 +105,6 @@ def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> No
 def _print_command(id16: str, command: str) -> None:
     if command:
         out.print_note(f"{id16}: made by: {command}")
-
-
-def _with_details(error: IntegrityError, details: dict[str, Any]) -> IntegrityError:
-    error.details = details
-    return error
 
 
 @collecting_command
