@@ -29,8 +29,9 @@ from irlcli.interventions import parse_setting
 MOST_EPISODES = 100_000
 Size = Annotated[int, Meta(ge=1, le=4096)]
 Settings = Annotated[tuple[str, ...], Meta(min_length=1)]
-MethodName = Annotated[str, Meta(max_length=100)]
-AlgorithmName = Annotated[str, Meta(max_length=100)]
+# Of a method or an algorithm.
+Name = Annotated[str, Meta(max_length=100)]
+# In the order of reports.
 Agent = Literal["expert", "student", "transfer", "clone", "random", "idle"]
 
 
@@ -65,7 +66,7 @@ class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class RewardOrigin(Struct, frozen=True, kw_only=True):
     """How a reward was learned, in the documents of what was measured by it."""
 
-    method: MethodName
+    method: Name
     seed: int
     settings: tuple[str, ...]
 
@@ -81,7 +82,7 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 
     env: str
     settings: Settings
-    method: MethodName
+    method: Name
     seed: int
     airl: AIRLConfig
     network: RewardNetwork
@@ -101,7 +102,7 @@ class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     env: str
     settings: Settings
-    method: MethodName
+    method: Name
     seed: int
     gridworld: GridworldConfig
     maxent: MaxEntConfig
@@ -136,10 +137,10 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     settings: Settings
     seed: int
     network: PolicyNetwork
-    method: MethodName | None = None
+    method: Name | None = None
     reward_seed: int | None = None
     reward_settings: tuple[str, ...] | None = None
-    algorithm: AlgorithmName = "ppo"
+    algorithm: Name = "ppo"
     ceiling: Quantile | None = None
     from_student: bool = False
     restarts: tuple[Finite, ...] = ()
@@ -169,10 +170,10 @@ class Subject(Struct, frozen=True, kw_only=True):
     agent: Agent
     env: str
     settings: tuple[str, ...] = ()
-    method: MethodName | None = None
+    method: Name | None = None
     seed: int | None = None
     reward_seed: int | None = None
-    algorithm: AlgorithmName = "ppo"
+    algorithm: Name = "ppo"
     ceiling: Quantile | None = None
     from_student: bool = False
     restarts: tuple[Finite, ...] = ()

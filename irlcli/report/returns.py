@@ -3,10 +3,10 @@
 # math instead of statistics: a cache hit prints returns, and statistics is slow to import.
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from irlcli import labels
-from irlcli.data.descriptions import Evaluation, Subject
+from irlcli.data.descriptions import Agent, Evaluation, Subject
 from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 from irlcli.report.agents import title
@@ -14,7 +14,7 @@ from irlcli.report.agents import title
 # A summary, the parameters behind it that seeds share, and whether its reward is the policy's own.
 EvaluationRun = tuple[Evaluation, Mapping[str, Any], bool]
 
-_ORDER = ("expert", "student", "transfer", "clone", "random", "idle")
+_ORDER = get_args(Agent)
 _HINT = "the runs in a row may differ in their seed only: report the others separately"
 
 

@@ -7,7 +7,7 @@ Every function is pure: arrays in, numbers out. A number that is not defined is 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -51,13 +51,13 @@ class Comparison:
         why: the reason for missing p-values; else empty.
     """
 
-    difference: float | None
-    interval: tuple[float, float] | None
-    detectable: float | None
-    welch: float | None
-    student: float | None
-    rank: float | None
-    improvement: float | None
+    difference: float | None = None
+    interval: tuple[float, float] | None = None
+    detectable: float | None = None
+    welch: float | None = None
+    student: float | None = None
+    rank: float | None = None
+    improvement: float | None = None
     why: str = ""
 
 
@@ -120,25 +120,23 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
     """``x`` [n] against ``y`` [m]."""
     a, b = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if not len(a) or not len(b):
-        return Comparison(
-            None, None, None, None, None, None, None, "one of the two methods has no seed"
-        )
-    difference = float(a.mean() - b.mean())
-    several = min(len(a), len(b)) > 1
-    rank, improvement = rank_test(a, b) if several else (None, None)
-    if not several:
-        why = "one seed has no variance; each method needs two"
-    elif not np.ptp(a) and not np.ptp(b):
-        why = "all seeds are equal, so the variance is zero"
-    else:
-        welch, student = (stats.ttest_ind(a, b, equal_var=v) for v in (False, True))
-        low, high = map(float, welch.confidence_interval(0.95))
-        p_welch, p_student = float(welch.pvalue), float(student.pvalue)
-        detectable = detectable_difference(a, b)
-        return Comparison(
-            difference, (low, high), detectable, p_welch, p_student, rank, improvement
-        )
-    return Comparison(difference, None, None, None, None, rank, improvement, why)
+        return Comparison(why="one of the two methods has no seed")
+    found = Comparison(float(a.mean() - b.mean()))
+    if min(len(a), len(b)) == 1:
+        return replace(found, why="one seed has no variance; each method needs two")
+    rank, improvement = rank_test(a, b)
+    found = replace(found, rank=rank, improvement=improvement)
+    if not np.ptp(a) and not np.ptp(b):
+        return replace(found, why="all seeds are equal, so the variance is zero")
+    welch, student = (stats.ttest_ind(a, b, equal_var=v) for v in (False, True))
+    low, high = map(float, welch.confidence_interval(0.95))
+    return replace(
+        found,
+        interval=(low, high),
+        detectable=detectable_difference(a, b),
+        welch=float(welch.pvalue),
+        student=float(student.pvalue),
+    )
 
 
 def detectable_difference(x: np.ndarray, y: np.ndarray) -> float:

@@ -127,15 +127,14 @@ def recorded_command(directory: Path, layout: Layout) -> str:
     """
     import shlex
 
-    try:
-        command = shlex.join(read_json(directory / PROVENANCE)["record"]["command"])
-    except (IntegrityError, KeyError, TypeError):
-        return ""
-    words = iter(shlex.split(command))
     kept = []
-    for word in words:
-        if word in ("--store", "--out"):
-            next(words, None)
-        elif not word.startswith(("--store=", "--out=")):
-            kept.append(word)
+    try:
+        words = iter(read_json(directory / PROVENANCE)["record"]["command"])
+        for word in words:
+            if word in ("--store", "--out"):
+                next(words, None)
+            elif not word.startswith(("--store=", "--out=")):
+                kept.append(word)
+    except (IntegrityError, AttributeError, KeyError, TypeError):
+        return ""
     return shlex.join([*kept, *layout.option])
