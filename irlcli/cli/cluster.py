@@ -12,6 +12,7 @@ from irlcli.cli import console as out
 from irlcli.cli.session import Session, StageSession
 from irlcli.errors import StageFailed, UsageError, suggest
 from irlcli.experiments.cluster.resources import DEFAULT_TIME, Resources, parse_minutes
+from irlcli.requests.tables import TableChoice
 
 if TYPE_CHECKING:
     from irlcli.experiments.cluster.queue import Queue
@@ -54,13 +55,34 @@ class ClusterOptions(NamedTuple):
     sbatch: Sequence[str]
     requeues: int | None
     jobs: int | None
+    detach: bool
+    status: bool
+    cancel: bool
 
-    def check_used(self, detach: bool) -> None:
-        """Refuse malformed options, and those that a run with this ``--cluster`` would ignore.
+    def check(self, choice: TableChoice, directory: Path | None, dry_run: bool) -> None:
+        """Refuse malformed options, and those that contradict each other or would be ignored.
+
+        ``directory`` is that of ``--out``.
 
         Raises:
             UsageError: names the first of them.
         """
+        asks = "--status" if self.status else "--cancel" if self.cancel else ""
+        makes = directory is not None or self.jobs is not None
+        if self.status + self.cancel + self.detach > 1:
+            raise UsageError(
+                "--status, --cancel and --detach exclude each other", "give one of them"
+            )
+        if choice.only is not None and makes:
+            raise UsageError("--only takes no --out or --jobs", "omit them: it makes one step")
+        if asks and makes:
+            raise UsageError(f"{asks} makes no step", "omit --out and --jobs")
+        if choice.until is not None and directory is not None:
+            raise UsageError("--until makes no report, so --out has no files", "omit one of them")
+        if choice.only is not None and self.cluster is not None:
+            raise UsageError("--only cannot be combined with --cluster", "omit one of them")
+        if self.detach and directory is not None:
+            raise UsageError("--detach makes no report, so --out has no files", "omit one of them")
         if self.cluster is not None and self.cluster not in CLUSTERS:
             raise UsageError(f"unknown --cluster {self.cluster!r}", suggest(self.cluster, CLUSTERS))
         slurm = {
@@ -70,7 +92,7 @@ class ClusterOptions(NamedTuple):
             "--sbatch": bool(self.sbatch),
         }
         both = {
-            "--detach": detach,
+            "--detach": self.detach,
             "--time": self.time is not None,
             "--requeues": self.requeues is not None,
         }
@@ -97,6 +119,10 @@ class ClusterOptions(NamedTuple):
         if self.time is not None:
             parse_minutes(self.time)
         _sbatch_options(self.sbatch)
+        if asks and dry_run:
+            raise UsageError(
+                "--dry-run shows the plan, not the jobs", "omit --dry-run, or --status and --cancel"
+            )
 
 
 def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
@@ -181,14 +207,13 @@ def run_jobs(
     plan: "Plan",
     words: Callable[[str], list[str]],
     options: ClusterOptions,
-    detach: bool,
 ) -> "Outcome | None":
-    """Submit what is missing and wait for it; None with ``detach``."""
+    """Submit what is missing and wait for it; None with ``--detach``."""
     from irlcli.cli.jobs import job_display
     from irlcli.experiments.cluster.submission import JobCommand, Submission
 
     queue = open_queue(session, options)
-    if detach and not queue.starts_what_waits:
+    if options.detach and not queue.starts_what_waits:
         raise UsageError(
             f"--detach does not work with --cluster {queue.name}", "omit --detach: it must wait"
         )
@@ -211,7 +236,7 @@ def run_jobs(
         )
         if count:
             session.console.say(f"{out.counted(count, 'job')} submitted")
-        if detach:
+        if options.detach:
             if session.as_json:
                 out.print_json("submission", {"table": plan.table.name, "submitted": count})
             return None

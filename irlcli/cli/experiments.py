@@ -4,7 +4,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -200,19 +200,19 @@ def run(
     """
     choice = TableChoice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     options = ClusterOptions(
-        cluster, partition, time, cpus, array_parallelism, sbatch, requeues, jobs
+        cluster,
+        partition,
+        time,
+        cpus,
+        array_parallelism,
+        sbatch,
+        requeues,
+        jobs,
+        detach,
+        status,
+        cancel,
     )
-    if status + cancel + detach > 1:
-        raise UsageError("--status, --cancel and --detach exclude each other", "give one of them")
-    about_jobs: Literal["status", "cancel"] | None = (
-        "status" if status else "cancel" if cancel else None
-    )
-    _check_options(choice, directory, options, about_jobs, detach)
-    options.check_used(detach)
-    if session.dry_run and (status or cancel):
-        raise UsageError(
-            "--dry-run shows the plan, not the jobs", "omit --dry-run, or --status and --cancel"
-        )
+    options.check(choice, directory, session.dry_run)
     runner = session.runner()
     plan = open_plan(session, choice)
     check_tag(session, choice, plan.table)
@@ -233,7 +233,7 @@ def run(
             outcome = _make_all(session, runner, plan, choice, jobs or 1)
         else:
             words = _child_words(session, choice, plan)
-            ended = cluster_jobs.run_jobs(session, runner, plan, words, options, detach)
+            ended = cluster_jobs.run_jobs(session, runner, plan, words, options)
             if ended is None:
                 return
             outcome = ended
@@ -243,32 +243,6 @@ def run(
     if session.as_json and until is not None:
         counts = {field: len(getattr(outcome, field)) for field in ("existed", "copied", "made")}
         out.print_json("run", {"table": table, **counts})
-
-
-def _check_options(
-    choice: TableChoice,
-    directory: Path | None,
-    options: ClusterOptions,
-    about_jobs: Literal["status", "cancel"] | None,
-    detach: bool,
-) -> None:
-    """Refuse options that contradict each other, or would be ignored, before any work.
-
-    ``about_jobs`` is the option that asks about jobs, None if none does.
-
-    Raises:
-        UsageError: names them.
-    """
-    if choice.only is not None and (directory or options.jobs):
-        raise UsageError("--only takes no --out or --jobs", "omit them: it makes one step")
-    if about_jobs and (directory or options.jobs):
-        raise UsageError(f"--{about_jobs} makes no step", "omit --out and --jobs")
-    if choice.until is not None and directory is not None:
-        raise UsageError("--until makes no report, so --out has no files", "omit one of them")
-    if choice.only is not None and options.cluster is not None:
-        raise UsageError("--only cannot be combined with --cluster", "omit one of them")
-    if detach and directory is not None:
-        raise UsageError("--detach makes no report, so --out has no files", "omit one of them")
 
 
 def _make_one(session: StageSession, runner: "Runner", plan: "Plan", only: str) -> None:
