@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from irlcli import labels
 from irlcli.data.descriptions import Assessment
 from irlcli.errors import UsageError
+from irlcli.experiments import references
 from irlcli.report.returns import as_json
 from irlcli.requests.evaluate import measured
 from irlcli.requests.session import Session
@@ -72,11 +71,13 @@ class Stored:
         """
         import pandas as pd
 
+        store, artefact = self._session.store, self._artefact
         if output is None and self.stage == "evaluate":
-            return pd.DataFrame(as_json([measured(self._session, self._artefact)]))
+            return pd.DataFrame(as_json([measured(self._session, artefact)]))
         if output is None and self.stage == "assess":
-            return pd.DataFrame(_bank(read_json(self.output("assessment.json"))))
-        names = [output.path for output in self._artefact.manifest.outputs]
+            found = references.output(store, artefact, "assessment.json", Assessment)
+            return pd.DataFrame(_bank(found))
+        names = [output.path for output in artefact.manifest.outputs]
         if output is None:
             output = next((name for name in _TABLES if name in names), "")
         if output.endswith(".parquet"):
@@ -90,28 +91,30 @@ class Stored:
         )
 
 
-def _bank(assessment: dict[str, Any]) -> list[dict[str, Any]]:
-    """Mean returns of each policy in each setting, with standard errors, and the verdict on it."""
-    whole = msgspec.convert(assessment, Assessment)
-    verdicts = {
-        (of.setting, policy): split.verdict
-        for of in whole.settings
-        for policy, split in whole.verdicts(of.setting).items()
-    }
-    return [
-        {
-            "setting": entry["setting"],
-            "policy": entry["policy"],
-            "kind": entry["kind"],
-            "true": entry["true"]["mean"],
-            "true_error": entry["true"]["error"],
-            "learned": entry["learned"]["mean"],
-            "learned_error": entry["learned"]["error"],
-            "progress": entry["progress"],
-            "verdict": verdicts.get((entry["setting"], entry["policy"])),
-        }
-        for entry in assessment["bank"]
-    ]
+def _bank(assessment: Assessment) -> list[dict[str, Any]]:
+    """Mean returns of each policy in each setting, with standard errors, and the verdict on it.
+
+    ``clear`` is False for a verdict that is uncertain.
+    """
+    verdicts = {s.setting: assessment.verdicts(s.setting) for s in assessment.settings}
+    rows = []
+    for entry in assessment.bank:
+        split = verdicts.get(entry.setting, {}).get(entry.policy)
+        rows.append(
+            {
+                "setting": entry.setting,
+                "policy": entry.policy,
+                "kind": entry.kind,
+                "true": entry.true.mean,
+                "true_error": entry.true.error,
+                "learned": entry.learned.mean,
+                "learned_error": entry.learned.error,
+                "progress": entry.progress,
+                "verdict": split and split.verdict,
+                "clear": split and split.clear,
+            }
+        )
+    return rows
 
 
 class Evaluations(Sequence[Stored]):

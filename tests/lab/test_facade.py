@@ -13,7 +13,7 @@ import typer
 
 import irlcli
 from irlcli.cli.app import app
-from irlcli.errors import Interrupted, NotFound, UsageError
+from irlcli.errors import IntegrityError, Interrupted, NotFound, UsageError
 from irlcli.lab.arguments import words
 from irlcli.lab.display import NotebookConsole
 from irlcli.store import Store
@@ -141,6 +141,34 @@ def test_an_assessment_is_the_commands_and_a_table_of_its_bank(lab, irl):
     record = Store(lab.store).resolve(made.id).artefact.provenance()
     done = irl(*record["command"][1:], "--json")
     assert json.loads(done.out)["id"] == made.id and "HIT assess" in done.err
+
+
+def test_an_uncertain_verdict_and_a_malformed_assessment_of_another_store(tmp_path, publish):
+    score = {"mean": 1.0, "error": 0.5}
+    entries = [("expert", 9.0), ("random", 0.0), ("retrained", 1.0)]
+    bank = [
+        {"policy": kind, "kind": kind, "setting": "mass=4x", "progress": None, "learned": score}
+        | {"true": {"mean": mean, "error": 0.5}}
+        for kind, mean in entries
+    ]
+    split = {"policy": "retrained", "true_regret": score, "learned_gap": score}
+    split |= {"verdict": "wrong reward", "clear": False}
+    none = {"policies": 3, "spearman": None, "pearson": None}
+    setting = {"setting": "mass=4x", "overall": none, "lower_half": none, "retrained": [split]}
+    reward = {"method": "erm", "seed": 0, "settings": ["mass=2x"]}
+    document = {"env": "ant", "reward": reward, "settings": [setting], "pooled": None, "bank": bank}
+    store = Store(tmp_path / "runs")
+
+    def table(document, seed):
+        files = {"assessment.json": json.dumps(document).encode()}
+        made = publish(store, files, stage="assess", parameters={"seed": seed})
+        return irlcli.Lab(store.root).artefact(made.artefact.id).to_pandas()
+
+    found = table(document, 0).set_index("policy")
+    assert found.loc["retrained", ["verdict", "clear"]].tolist() == ["wrong reward", False]
+    assert found.loc["expert", ["verdict", "clear"]].isna().all()
+    with pytest.raises(IntegrityError, match=r"assessment\.json"):
+        table(document | {"bank": 7}, 1)
 
 
 def test_settings_may_be_lists(lab):
