@@ -288,7 +288,8 @@ def weights(text: str) -> list[float] | Literal["own"]:
     if text == "own":
         return "own"
     try:
-        return msgspec.convert(text.split(","), list[NonNegative], strict=False)
+        parts = [part.strip() for part in text.split(",")]
+        return msgspec.convert(parts, list[NonNegative], strict=False)
     except msgspec.ValidationError:
         raise UsageError(
             f"--choose-penalty {text!r} is not a list of numbers from 0 up",

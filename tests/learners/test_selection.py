@@ -18,6 +18,7 @@ from irlcli.errors import StageFailed
 from irlcli.experiments.runner import Silent
 from irlcli.learners.discriminator import full_weight_from, penalty_weight_at
 from irlcli.learners.selection import BestRound, hold_out, log_likelihood
+from irlcli.requests.arguments import weights
 from irlcli.rl.rollout import roll_out
 from irlcli.stages import choose_penalty
 from irlcli.stages.base import Job, environment_key
@@ -278,6 +279,10 @@ def test_the_setting_that_selects_scores_by_true_return_and_is_not_trained_on(st
     policy, _ = load_policy_file(made / "policy.pt")
     episodes = roll_out(LANDER, SETTINGS[0], policy, 4, 3, "selection")
     assert max(scores) == pytest.approx(np.mean([t.episode_return for t in episodes]))
+
+
+def test_candidates_for_lambda_may_have_spaces_between_them():
+    assert weights(" 0.1, 1 ") == [0.1, 1]
 
 
 @pytest.mark.parametrize(
