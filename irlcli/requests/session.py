@@ -135,9 +135,8 @@ class StageSession(Session):
         from irlcli.configs import file_without_profile, load_config
 
         source = file_without_profile(env, self.profile)
-        if source and source not in self._warned:
-            self._warned.add(source)
-            self.console.warn(
+        if source:
+            self._warn_once(
                 f"{source} has no [profiles.{self.profile}]: its values outside [profiles] are used"
             )
         files = [file for file in (self.table_file, self.file) if file is not None]
@@ -216,19 +215,31 @@ class StageSession(Session):
         (made,) = self.run([request])
         return made, self.store.open(made, output)
 
-    def warn_of_unread(self, requests: Sequence["Request"]) -> None:
-        """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold."""
+    def warn_of_unread(self, requests: Sequence["Request"], table: str | None = None) -> None:
+        """Warn of a ``--set`` whose field or value ``requests`` and what they need do not hold.
+
+        With the name of a ``table``, ``requests`` are all of its steps.
+        """
         if not self.asked:
             return
         from irlcli.requests.overrides import behind, replaced, unread
 
-        every = [made for request in (*self.prepared, *requests) for made in behind(request)]
+        every = requests
+        if table is None:
+            every = [made for request in (*self.prepared, *requests) for made in behind(request)]
         for line in replaced(self.asked, every):
-            self.console.warn(line)
+            self._warn_once(line)
         # A bank is looked for under the whole config.
-        whole = any(request.stage.name == "assess" for request in every)
+        whole = table is None and any(request.stage.name == "assess" for request in every)
+        reader = "stage of this command" if table is None else f"step of {table}"
         for item in () if whole else unread(self.asked, every):
-            self.console.warn(f"no stage of this command reads --set {item}")
+            self._warn_once(f"no {reader} reads --set {item}")
+
+    def _warn_once(self, message: str) -> None:
+        # A figure's report needs the steps of its table, which were looked at before.
+        if message not in self._warned:
+            self._warned.add(message)
+            self.console.warn(message)
 
 
 def _check_repeated(overrides: Sequence[str]) -> None:

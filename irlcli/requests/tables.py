@@ -10,7 +10,6 @@ from irlcli.configs.documents import read_toml
 from irlcli.configs.load import in_profile
 from irlcli.errors import UsageError, suggest
 from irlcli.requests import arguments
-from irlcli.requests.overrides import replaced, unread
 from irlcli.requests.session import StageSession, check_path
 
 if TYPE_CHECKING:
@@ -139,7 +138,7 @@ def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
     _check_weights(session, table)
     if choice.only is None:
         # The processes that make one step each would repeat it.
-        _warn_of_unread(session, plan)
+        session.warn_of_unread([task.request for task in plan.tasks.values()], table.name)
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
@@ -167,16 +166,6 @@ def _check_weights(session: StageSession, table: "Table") -> None:
             f"{given[-1]} does not apply to {', '.join(listed)}: {table.name} lists their lambda",
             "omit them from --methods, or change the table with --experiments",
         )
-
-
-def _warn_of_unread(session: StageSession, plan: "Plan") -> None:
-    if not session.overrides:
-        return
-    requests = [task.request for task in plan.tasks.values()]
-    for line in replaced(session.overrides, requests):
-        session.console.warn(line)
-    for item in unread(session.overrides, requests):
-        session.console.warn(f"no step of {plan.table.name} reads --set {item}")
 
 
 def _weights_in(tree: Mapping[str, Any], knobs: Set[str]) -> Iterator[str]:

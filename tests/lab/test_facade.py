@@ -293,4 +293,5 @@ def test_a_field_that_a_call_sets_in_vain_is_named(lab, capsys):
     # One of the lab's may be for other calls.
     other = irlcli.Lab(lab.store, profile="smoke", set={"transfer.total_steps": 5})
     other.evaluate(idle=True, **IDLE)
+    other.plan("figure2", tag="x")
     assert "transfer.total_steps" not in capsys.readouterr().err
