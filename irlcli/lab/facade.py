@@ -118,15 +118,9 @@ class Lab:
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        options: dict[str, Any] = {
-            "env": str(env),
-            "intervention": joined(intervention),
-            "setting": listed(setting),
-            "expert": [f"{where}={self._ref(who)}" for where, who in (expert or {}).items()],
-            "trust": trust,
-            "episodes": joined(episodes),
-            "seed": whole("seed", seed),
-        }
+        options = self._options(locals())
+        options["expert"] = [f"{where}={self._ref(who)}" for where, who in (expert or {}).items()]
+        options["episodes"] = joined(episodes)
         with self._at_work(configs, words("collect-experts", options)) as session:
             stored = self._run(session, collect.collect_experts(session, **options), name)
             for warning in collect.missed_bars(session, collect.summary(session, stored._artefact)):
@@ -158,14 +152,8 @@ class Lab:
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        sources = [str(source) for source in listed(recordings)]
-        options: dict[str, Any] = {
-            "env": str(env),
-            "intervention": joined(intervention),
-            "setting": listed(setting),
-            "setting_column": setting_column,
-            "cut": cut,
-        }
+        options = self._options(locals())
+        sources = [str(source) for source in listed(options.pop("recordings"))]
         with self._at_work(configs, words("import", options, *sources)) as session:
             request = collect.import_demonstrations(session, recordings=sources, **options)
             return self._run(session, request, name)
@@ -202,18 +190,7 @@ class Lab:
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        options: dict[str, Any] = {
-            "demos": self._ref(demos),
-            "method": method,
-            "grouping": grouping,
-            "penalty": penalty,
-            "penalty_weight": number("penalty_weight", penalty_weight),
-            "choose_penalty": joined(choose_penalty),
-            "select": select,
-            "state_only": state_only,
-            "env": joined(env),
-            "seed": whole("seed", seed),
-        }
+        options = self._options(locals())
         with self._at_work(configs, words("train-airl", options)) as session:
             request = train.train_airl(session, **options)
             assert request is not None  # A lab has no dry run.
@@ -242,16 +219,7 @@ class Lab:
             l2: weight decay.
             features: ``learned`` or ``linear``.
         """
-        options: dict[str, Any] = {
-            "demos": self._ref(demos),
-            "method": method,
-            "grouping": grouping,
-            "penalty": penalty,
-            "penalty_weight": number("penalty_weight", penalty_weight),
-            "l2": number("l2", l2),
-            "features": features,
-            "seed": whole("seed", seed),
-        }
+        options = self._options(locals())
         with self._at_work(configs, words("train-maxent", options)) as session:
             return self._run(session, train.train_maxent(session, **options), name)
 
@@ -283,16 +251,7 @@ class Lab:
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        options: dict[str, Any] = {
-            "reward": self._ref(reward),
-            "ood": joined(ood),
-            "intervention": joined(intervention),
-            "setting": listed(setting),
-            "algorithm": algorithm,
-            "start": start,
-            "env": joined(env),
-            "seed": whole("seed", seed),
-        }
+        options = self._options(locals())
         with self._at_work(configs, words("transfer", options)) as session:
             return self._run(session, retraining.transfer(session, **options), name)
 
@@ -329,20 +288,8 @@ class Lab:
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        options: dict[str, Any] = {
-            "policy": None if policy is None else self._ref(policy),
-            "expert": expert,
-            "trained_in": joined(trained_in),
-            "random": random,
-            "idle": idle,
-            "reward": None if reward is None else self._ref(reward),
-            "ood": joined(ood),
-            "intervention": joined(intervention),
-            "setting": listed(setting),
-            "env": joined(env),
-            "episodes": None if episodes is None else whole("episodes", episodes, 1),
-            "seed": whole("seed", seed),
-        }
+        options = self._options(locals())
+        options["episodes"] = None if episodes is None else whole("episodes", episodes, 1)
         with self._at_work(configs, words("evaluate", options)) as session:
             requests = evaluation.evaluate(session, **options, name=name)
             session.warn_of_unread(requests)
@@ -375,16 +322,9 @@ class Lab:
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
-        options: dict[str, Any] = {
-            "ood": joined(ood),
-            "intervention": joined(intervention),
-            "setting": listed(setting),
-            "demos": None if demos is None else self._ref(demos),
-            "env": joined(env),
-            "episodes": None if episodes is None else whole("episodes", episodes, 1),
-            "seed": whole("seed", seed),
-        }
-        ref = self._ref(reward)
+        options = self._options(locals())
+        options["episodes"] = None if episodes is None else whole("episodes", episodes, 1)
+        ref = options.pop("reward")
         with self._at_work(configs, words("assess", options, ref)) as session:
             return self._run(session, assessment.assess(session, reward=ref, **options)[0], name)
 
@@ -468,6 +408,25 @@ class Lab:
     def _run(self, session: StageSession, request: Request, name: str | None) -> Stored:
         session.warn_of_unread([request])
         return Stored(session, session.run([request], name)[0])
+
+    def _options(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """A method's arguments, its ``locals()``, as the command's options take them."""
+        options = {}
+        for name, value in given.items():
+            if name in ("self", "name", "configs"):
+                continue
+            if name in ("demos", "policy", "reward"):
+                value = None if value is None else self._ref(value)
+            elif name in ("env", "intervention", "ood", "trained_in", "choose_penalty"):
+                value = joined(value)
+            elif name == "setting":
+                value = listed(value)
+            elif name in ("penalty_weight", "l2"):
+                value = number(name, value)
+            elif name == "seed":
+                value = whole(name, value)
+            options[name] = value
+        return options
 
     def _ref(self, ref: Ref) -> str:
         if not isinstance(ref, Stored):
