@@ -72,7 +72,7 @@ def converted(value: Any, form: type[Form], where: str, examples: str) -> Form:
         return msgspec.convert(value, form)
     except msgspec.ValidationError as error:
         message, _, place = str(error).partition(" - at ")
-        field = _with_key(value, form, place.strip("`").removeprefix("$").lstrip("."))
+        field = with_key(value, form, place.strip("`").removeprefix("$").lstrip("."))
         missing = re.search(r"missing required field `(\w+)`", message)
         if missing:
             raise UsageError(f"{where}.{missing[1]} is missing", f"write it in [{where}]") from None
@@ -81,7 +81,7 @@ def converted(value: Any, form: type[Form], where: str, examples: str) -> Form:
         ) from None
 
 
-def _with_key(value: Mapping[str, Any], form: type[Form], field: str) -> str:
+def with_key(value: Mapping[str, Any], form: type[Form], field: str) -> str:
     """``field`` of an error with the key of its dictionary, for which msgspec writes ``[...]``."""
     name, inside, rest = field.partition("[...]")
     for key in value[name] if inside else ():

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from irlcli.configs.documents import parse_toml, read_toml
+from irlcli.configs.documents import parse_toml, read_toml, with_key
 from irlcli.configs.relevance import check_registered
 from irlcli.configs.schema import (
     AIRLConfig,
@@ -78,21 +78,20 @@ def load_config(
     layers = in_profile(own, tree, profile)
     for file in files:
         layers += in_profile(str(file), read_toml(file), profile)
-    nested = [(item, _override(item)) for item in overrides]
-    _check_set_once(nested, flags or {})
-    layers += [(f"--set {item!r}", values) for item, values in nested]
+    given = [(item, *_override(item)) for item in overrides]
+    _check_set_once(given, flags or {})
+    layers += [(f"--set {item!r}", _nest(dotted, value)) for item, dotted, value in given]
     layers += [
-        (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted.split("."), value))
+        (f"--{dotted.rpartition('.')[2].replace('_', '-')}", _nest(dotted, value))
         for dotted, value in (flags or {}).items()
         if value is not None
     ]
     return _stack(env, layers)
 
 
-def _check_set_once(overrides: Sequence[Layer], flags: Mapping[str, Any]) -> None:
+def _check_set_once(overrides: Sequence[tuple[str, str, Any]], flags: Mapping[str, Any]) -> None:
     """Refuse an override whose field a flag sets to another value: it would be ignored."""
-    for item, values in overrides:
-        dotted, value = _field_of(item, values)
+    for item, dotted, value in overrides:
         if flags.get(dotted) not in (None, value):
             raise UsageError(
                 f"--set {item!r}: the method or another option sets {dotted} to {flags[dotted]!r}",
@@ -144,27 +143,28 @@ def in_profile(source: str, tree: Mapping[str, Any], profile: str) -> list[Layer
 
 def _stack(env: str, layers: Layers) -> Config:
     """The config of ``layers`` of (source, values); later layers win."""
-    layers = [(source, _with_none(values, Config)) for source, values in layers]
+    checked: list[Layer] = []
     tree: dict[str, Any] = {}
     for source, values in layers:
         if tree and not values:
             # The standard profile is usually empty, and every command comes through here.
             continue
         try:
-            _check_names(values, Config, ())
+            values = _checked(values, Config)
+            checked.append((source, values))
             tree = _merge(tree, values)
             config = _convert(env, tree)
         except UsageError as error:
             raise UsageError(f"{source}: {error.message}", error.hint) from None
     interventions = {
-        knob: _with_sections(knob, intervention, layers)
+        knob: _with_sections(knob, intervention, checked)
         for knob, intervention in config.interventions.items()
     }
     return msgspec.structs.replace(
         config,
         interventions=interventions,
-        airl=_airl(layers),
-        transfer=msgspec.convert(_transfer(layers), TransferConfig),
+        airl=_airl(checked),
+        transfer=msgspec.convert(_transfer(checked), TransferConfig),
     )
 
 
@@ -227,11 +227,10 @@ def overridden(items: Sequence[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     values: dict[str, Any] = {}
     for item in items:
-        nested = _override(item)
-        dotted, value = _field_of(item, nested)
+        dotted, value = _override(item)
         if dotted in values:
             raise UsageError(f"{dotted} appears twice", "name each field once")
-        tree = _merge(tree, nested)
+        tree = _merge(tree, _nest(dotted, value))
         values[dotted] = value
     check_registered(msgspec.convert(tree, Config))
     return values
@@ -262,8 +261,8 @@ def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _nest(path: Sequence[str], value: Any) -> dict[str, Any]:
-    for name in reversed(path):
+def _nest(dotted: str, value: Any) -> dict[str, Any]:
+    for name in reversed(dotted.split(".")):
         value = {name: value}
     return value
 
@@ -275,10 +274,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
         config = msgspec.convert(tree, Config)
     except msgspec.ValidationError as error:
         message, _, where = str(error).partition(" - at ")
-        field = where.strip("`").removeprefix("$.")
-        if field.startswith("interventions[...]"):
-            knob = next(k for k, v in tree["interventions"].items() if not _is_listed(v))
-            field = f"interventions.{knob}{field.removeprefix('interventions[...]')}"
+        field = with_key(tree, Config, where.strip("`").removeprefix("$."))
         raise UsageError(f"{field}: {of_types(message)}", _field_hint(field)) from None
     check_registered(config)
     for knob, values in config.interventions.items():
@@ -297,16 +293,11 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
     return config
 
 
-def _is_listed(values: Any) -> bool:
-    try:
-        msgspec.convert(values, InterventionConfig)
-    except msgspec.ValidationError:
-        return False
-    return True
+def _checked(tree: Any, kind: Any, path: tuple[str, ...] = ()) -> dict[str, Any]:
+    """``tree`` with None or unset for "none" where a field of ``kind`` may be: TOML has no null.
 
-
-def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
-    """Refuse unknown names, and values where tables belong: msgspec's messages name neither."""
+    Refuses unknown names, and values where tables belong: msgspec's messages name neither.
+    """
     if kind == _INTERVENTIONS:
         fields = dict.fromkeys(tree, InterventionConfig) if isinstance(tree, Mapping) else {}
         inside = "[interventions.KNOB] with id and ood"
@@ -316,23 +307,16 @@ def _check_names(tree: Any, kind: Any, path: tuple[str, ...]) -> None:
         inside = f"[{'.'.join(path)}] with some of: {', '.join(fields)}"
     if not isinstance(tree, Mapping):
         raise UsageError(f"{'.'.join(path)}: expected a table, found {tree!r}", f"write {inside}")
+    found = {}
     for name, value in tree.items():
         if name not in fields:
             where = ".".join((*path, str(name)))
             raise UsageError(f"unknown field {where!r}", suggest(str(name), fields))
         if inner := _table(fields[name]):
-            _check_names(value, inner, (*path, name))
-
-
-def _with_none(tree: Mapping[str, Any], kind: Any) -> dict[str, Any]:
-    """``tree`` with None or unset for "none" where a field of ``kind`` may be: TOML has no null."""
-    found = dict(tree)
-    for name, value in tree.items():
-        field = InterventionConfig if kind == _INTERVENTIONS else kind.__annotations__.get(name)
-        if value == "none" and _table(field) is None and (nothing := _nothing(field)):
-            (found[name],) = nothing
-        elif isinstance(value, Mapping) and (inner := _table(field)):
-            found[name] = _with_none(value, inner)
+            value = _checked(value, inner, (*path, name))
+        elif value == "none" and (nothing := _nothing(fields[name])):
+            (value,) = nothing
+        found[name] = value
     return found
 
 
@@ -350,11 +334,13 @@ def _table(field: Any) -> Any:
     return None
 
 
-def _override(item: str) -> dict[str, Any]:
+def _override(item: str) -> tuple[str, Any]:
+    """The field that ``item``, ``FIELD=VALUE``, names, and its typed value."""
     dotted, equals, text = item.partition("=")
-    path = dotted.strip().split(".")
+    dotted = dotted.strip()
+    path = dotted.split(".")
     if not equals:
-        raise UsageError(f"--set {item!r} has no '='", f"write --set {dotted.strip()}=VALUE")
+        raise UsageError(f"--set {item!r} has no '='", f"write --set {dotted}=VALUE")
     kind: Any = Config
     for i, name in enumerate(path):
         if not (isinstance(kind, type) and issubclass(kind, Struct)):
@@ -366,7 +352,7 @@ def _override(item: str) -> dict[str, Any]:
         if name not in fields:
             homes = [f"{home}.{name}" for home in _homes(name)] if len(path) == 1 else []
             hint = f"did you mean {' or '.join(homes)}?" if homes else suggest(name, fields)
-            raise UsageError(f"--set {item!r}: unknown field {dotted.strip()!r}", hint)
+            raise UsageError(f"--set {item!r}: unknown field {dotted!r}", hint)
         kind = fields[name]
         if kind == _INTERVENTIONS:
             raise UsageError(
@@ -375,17 +361,9 @@ def _override(item: str) -> dict[str, Any]:
                 "--settings",
             )
     if isinstance(kind, type) and issubclass(kind, Struct):
-        names = ", ".join(f"{dotted.strip()}.{f.name}" for f in msgspec.structs.fields(kind))
+        names = ", ".join(f"{dotted}.{f.name}" for f in msgspec.structs.fields(kind))
         raise UsageError(f"--set {item!r} names a group of fields", f"one of: {names}")
-    return _nest(path, _typed(text.strip(), kind, dotted.strip()))
-
-
-def _field_of(item: str, nested: Mapping[str, Any]) -> tuple[str, Any]:
-    """The field that ``item`` names, and its value in ``nested``."""
-    value: Any = nested
-    for name in field_of(item).split("."):
-        value = value[name]
-    return field_of(item), value
+    return dotted, _typed(text.strip(), kind, dotted)
 
 
 def _homes(name: str) -> list[str]:
