@@ -47,32 +47,9 @@ class RunConsole(Console, Protocol):
 class Silent(RunConsole):
     """A console that shows nothing."""
 
-    def progress(self, done: int, total: int, unit: str, facts: Mapping[str, Any]) -> None:
-        pass
+    def _ignore(self, *_: Any, **__: Any) -> None: ...
 
-    def warn(self, message: str) -> None:
-        pass
-
-    def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        pass
-
-    def start(self, label: str, resumed: bool) -> None:
-        pass
-
-    def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
-        pass
-
-    def found(self, label: str, artefact: Artefact, where: Path | str) -> None:
-        pass
-
-    def wait(self, label: str, holder: str) -> None:
-        pass
-
-    def say(self, text: str) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
+    progress = warn = scalars = start = finish = found = wait = say = close = _ignore
 
 
 @contextmanager
