@@ -53,10 +53,10 @@ class Where(NamedTuple):
             UsageError: malformed, named twice, or with other observations than ``origin``'s.
         """
         settings = [parse_setting(env, text) for text in self.several]
-        if origin is not None:
-            check_observed(env, origin.settings, settings)
         if self.text is not None:
             settings = [*named_settings(env, config, self.text, self.kind, origin), *settings]
+        if origin is not None:
+            check_observed(env, origin.settings, settings)
         check_distinct("the command", settings)
         return settings
 
@@ -85,15 +85,8 @@ def named_settings(
     ``3x,4x`` alone are values of the knob that ``origin`` was trained with.
 
     Raises:
-        UsageError: malformed, empty, or a setting whose observations differ from ``origin``'s.
+        UsageError: malformed or empty.
     """
-    settings = _parse(env, config, text, kind, origin)
-    if origin is not None:
-        check_observed(env, origin.settings, settings)
-    return settings
-
-
-def _parse(env, config, text, kind, origin) -> Sequence[Setting]:
     if "=" in text:
         return parse_settings(env, text)
     if text in config.interventions:
