@@ -1,35 +1,18 @@
 """``evaluate``: returns of policies, experts and baselines."""
 
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 from irlcli import labels
-from irlcli.data.descriptions import Evaluation
-from irlcli.data.descriptions import Reward as RewardDescription
+from irlcli.data.descriptions import Evaluation, Reward
 from irlcli.errors import UsageError
 from irlcli.experiments import references
 from irlcli.interventions import Setting, check_observed, parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import Session, StageSession
 from irlcli.stages import evaluate as stage
-from irlcli.stages.base import From, Request, Source
+from irlcli.stages.base import From, Request
 from irlcli.store import Artefact
-
-
-class _Reward(NamedTuple):
-    """A learned reward that scores the episodes besides the true one."""
-
-    ref: str
-    source: Source
-    origin: RewardDescription
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Keywords of ``evaluate.request``."""
-        from irlcli.stages.train_airl import reward_label
-
-        label = reward_label(self.origin.airl, self.origin.seed)
-        return {"reward": self.source, "reward_label": label}
 
 
 def evaluate(
@@ -65,17 +48,21 @@ def evaluate(
     if trained_in is not None and not expert:
         raise UsageError("--trained-in selects experts, but --expert is missing", "add --expert")
     env = arguments.env_name(env)
-    scored_by = None
+    scorer: Reward | None = None
+    scored: dict[str, Any] = {}
     if reward is not None:
-        source, origin = references.tensor_file(session.store, reward, "reward")
-        arguments.check_env(reward, origin.env, env)
-        scored_by = _Reward(reward, source, origin)
+        from irlcli.stages.train_airl import reward_label
+
+        source, scorer = references.tensor_file(session.store, reward, "reward")
+        arguments.check_env(reward, scorer.env, env)
+        env = scorer.env
+        scored = {"reward": source, "reward_label": reward_label(scorer.airl, scorer.seed)}
     if policy is not None:
-        requests = [_of_policy(session, policy, where, env, episodes, seed, scored_by)]
+        requests = [_of_policy(session, policy, where, env, episodes, seed, scorer, scored)]
     else:
         agent: Literal["expert", "random", "idle"]
         agent = "expert" if expert else "random" if random else "idle"
-        requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scored_by)
+        requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scorer, scored)
     if name is not None and len(requests) > 1:
         raise UsageError(
             f"--name {name!r} cannot name {len(requests)} evaluations",
@@ -98,7 +85,8 @@ def _of_policy(
     env: str | None,
     episodes: int | None,
     seed: int,
-    scored_by: _Reward | None,
+    scorer: Reward | None,
+    scored: Mapping[str, Any],
 ) -> Request:
     source, origin = references.tensor_file(session.store, policy, "policy")
     arguments.check_env(policy, origin.env, env)
@@ -111,9 +99,8 @@ def _of_policy(
             arguments.warn_of_seen(session.console, settings, origin, policy)
     else:
         settings = [parse_setting(origin.env, text) for text in origin.settings]
-    if scored_by is not None:
-        arguments.check_env(scored_by.ref, scored_by.origin.env, origin.env)
-        check_observed(origin.env, scored_by.origin.settings, settings)
+    if scorer is not None:
+        check_observed(origin.env, scorer.settings, settings)
     label = f"{origin.agent} of {', '.join(origin.settings)}"
     if origin.method is not None:
         how = labels.retrained(
@@ -127,7 +114,7 @@ def _of_policy(
         source,
         seed=seed,
         policy_label=label,
-        **({} if scored_by is None else scored_by.arguments),
+        **scored,
     )
 
 
@@ -139,10 +126,9 @@ def _of_agent(
     env: str | None,
     episodes: int | None,
     seed: int,
-    scored_by: _Reward | None,
+    scorer: Reward | None,
+    scored: Mapping[str, Any],
 ) -> list[Request]:
-    if scored_by is not None:
-        env = scored_by.origin.env
     if env is None or not where.given:
         missing = "--env ENV " if env is None else ""
         raise UsageError(
@@ -150,11 +136,9 @@ def _of_agent(
             f"add {missing}--intervention KNOB=VALUE,VALUE or --ood KNOB=VALUE",
         )
     config = session.config(env, {"evaluation.episodes": episodes})
-    origin = None if scored_by is None else scored_by.origin
-    settings = where.settings(env, config, origin)
-    score = {} if scored_by is None else scored_by.arguments
+    settings = where.settings(env, config, scorer)
     if agent != "expert":
-        return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **score)]
+        return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **scored)]
     from irlcli.stages import train_expert
 
     experts: list[tuple[Setting, Sequence[Setting]]]
@@ -162,12 +146,11 @@ def _of_agent(
         experts = [(setting, [setting]) for setting in settings]
     else:
         trained = arguments.named_settings(env, config, trained_in, "id")
-        experts = [(setting, settings) for setting in trained]
-        for setting, measured in experts:
-            check_observed(env, [str(setting)], measured)
+        for setting in trained:
+            check_observed(env, [str(setting)], settings)
         # Settings that differ in their cue only have one expert.
-        worlds = {str(own): own for own in (without_cue(env, setting) for setting in trained)}
-        experts = [(own, settings) for own in worlds.values()]
+        worlds = dict.fromkeys(without_cue(env, setting) for setting in trained)
+        experts = [(world, settings) for world in worlds]
     return [
         stage.request(
             env,
@@ -176,7 +159,7 @@ def _of_agent(
             From(train_expert.demonstrator(env, own, config), "policy.pt"),
             seed=seed,
             policy_label=f"expert of {own}",
-            **score,
+            **scored,
         )
         for own, measured in experts
     ]
