@@ -1,18 +1,15 @@
 """A table as a list of named steps, and what a store holds of each."""
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
-import msgspec
-
 from irlcli.configs import Config
 from irlcli.errors import UsageError, closest
 from irlcli.experiments import figures, rows
 from irlcli.experiments.rows import PHASES, Chosen, RewardRun, Task
-from irlcli.experiments.status import STATUSES, Lookup, Step, waiting
+from irlcli.experiments.status import STATUSES, Identities, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
 from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
 from irlcli.stages import choose_penalty
@@ -74,7 +71,7 @@ class Plan:
         self.lookup.forget_missing()
         self.tasks, self.needs, self.cells, self.identities = {}, {}, [], {}
         names: dict[str, str] = {}
-        identities = _Identities()
+        identities = Identities()
         last = PHASES.index(self.selection.until)
         for task in self._all_tasks():
             if PHASES.index(task.phase) > last:
@@ -186,27 +183,6 @@ class Plan:
         """How many steps have each status."""
         found = Counter(self.lookup(task.request).status for task in self.tasks.values())
         return {status: found[status] for status in STATUSES}
-
-
-class _Identities:
-    """Digests that are equal for equal requests."""
-
-    def __init__(self) -> None:
-        self._known: dict[int, tuple[Request, str]] = {}
-
-    def __call__(self, request: Request) -> str:
-        if id(request) not in self._known:
-            inputs = {
-                role: [self(source.request), source.output]
-                if isinstance(source, From)
-                else source.sha256
-                for role, source in request.inputs.items()
-            }
-            whole = [request.stage.name, request.stage.version, request.parameters, inputs]
-            # No key: canonical JSON would take a third of the time of planning 10,000 runs.
-            encoded = msgspec.json.encode(whole, order="deterministic")
-            self._known[id(request)] = request, hashlib.sha256(encoded).hexdigest()
-        return self._known[id(request)][1]
 
 
 def _cached(configs: Configs) -> Configs:
