@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.introduce import introduce
-from irlcli.experiments.status import source_of
+from irlcli.experiments.status import foreign_source, source_in
 from irlcli.stages.base import Source
-from irlcli.store import Artefact, Index, Resolved, Store, read_json
+from irlcli.store import Artefact, Index, Store, read_json
 
 if TYPE_CHECKING:
     from irlcli.stages.import_demonstrations import Form
@@ -55,7 +55,7 @@ def tensor_file(
                 f"name an artefact or a {kind} file; {store.listing}",
             )
         description, _ = load(path, kind)
-        return source_of(Resolved(None, path)), description
+        return foreign_source(path), description
     introduce(artefact)
     if artefact.manifest.record.stage == "train-maxent":
         raise UsageError(
@@ -76,7 +76,7 @@ def tensor_file(
             if holds
             else f"its artefact holds no {kind}; {store.listing}",
         )
-    source = source_of(Resolved(artefact, artefact.directory / output))
+    source = source_in(artefact, output)
     path = store.open(artefact, _required(artefact, f"{kind}.json"))
     if kind == "reward":
         return source, descriptions.parse(read_json(path), descriptions.Reward, path)
@@ -95,7 +95,7 @@ def expert(store: Store, env: str, ref: str) -> Source:
         path = Path(ref)
         if not path.is_file():
             raise NotFound(f"there is no file {ref}", "name a file that model.save() wrote")
-        return source_of(Resolved(None, path))
+        return foreign_source(path)
     source, about = tensor_file(store, ref, "policy")
     if about.env != env:
         raise UsageError(
@@ -113,7 +113,7 @@ def normaliser(name: str) -> Source:
     """
     if not Path(name).is_file():
         raise NotFound(f"there is no file {name}", "name a file that VecNormalize.save wrote")
-    return source_of(Resolved(None, Path(name)))
+    return foreign_source(Path(name))
 
 
 def student_beside(store: Store, reward: Source, origin: descriptions.Reward) -> Source:
@@ -123,8 +123,7 @@ def student_beside(store: Store, reward: Source, origin: descriptions.Reward) ->
         NotFound: there is none beside the reward's file, or that of another reward.
     """
     if reward.artefact is not None:
-        student = reward.artefact.directory / _required(reward.artefact, "policy.pt")
-        return source_of(Resolved(reward.artefact, student))
+        return source_in(reward.artefact, _required(reward.artefact, "policy.pt"))
     student = reward.path.parent / "policy.pt"
     if not student.is_file():
         raise NotFound(
@@ -182,7 +181,7 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
                 )
             raise NotFound(f"{ref!r} is neither an artefact nor a directory with {EPISODES}", hint)
         demos = read_demonstrations(Path(ref))
-        return source_of(resolved), demos.env, list(demos.trajectories)
+        return foreign_source(resolved.path), demos.env, list(demos.trajectories)
     introduce(artefact)
     record = artefact.manifest.record
     if record.stage not in ("collect-experts", "import") or resolved.output is not None:
@@ -192,7 +191,7 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
             "name an artefact of `irl collect-experts` or `irl import`",
         )
     about = descriptions.parse(record.parameters, descriptions.Dataset, artefact.directory)
-    return source_of(resolved), about.env, list(about.settings)
+    return source_in(artefact, None), about.env, list(about.settings)
 
 
 def recorded(texts: Sequence[str]) -> tuple[Form, list[Source]]:
@@ -230,7 +229,7 @@ def _recorded(text: str) -> Source:
         hint = "name a Parquet file, minari:DATASET, or a directory of imitation's trajectories"
     if not path.exists():
         raise NotFound(f"there is nothing at {path}", hint)
-    source = source_of(Resolved(None, path))
+    source = foreign_source(path)
     if path.is_file() and not _is_parquet(path):
         raise UsageError(f"{path} is not a Parquet file", hint)
     if _form(text) == "imitation":

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed, file_failure
 from irlcli.experiments.introduce import described
-from irlcli.experiments.status import Lookup, Step, checked, key_record, source_in, source_of
+from irlcli.experiments.status import Lookup, Step, checked, foreign_source, key_record, source_in
 from irlcli.stages.base import Console, From, Job, Request, Source
-from irlcli.store import Artefact, KeyRecord, Resolved, Store
+from irlcli.store import Artefact, KeyRecord, Store
 
 if TYPE_CHECKING:
     from irlcli.store.sources import Place
@@ -236,7 +236,7 @@ class Runner:
         """The path of an input whose bytes have the digest that the key holds."""
         foreign = source.artefact is None
         # It was hashed when the run was planned, which may be hours ago.
-        if foreign and source_of(Resolved(None, source.path)).sha256 != source.sha256:
+        if foreign and foreign_source(source.path).sha256 != source.sha256:
             raise IntegrityError(
                 f"{source.path} changed after this run was planned",
                 "run the same command again",

@@ -213,24 +213,32 @@ def source_of(resolved: Resolved) -> Source:
     """A resolved reference as a stage's input.
 
     Raises:
-        UsageError: a foreign directory without files, or one that cannot be read.
-        IntegrityError: a foreign directory that holds links, pipes or names that no output can
-            have.
+        UsageError, IntegrityError: as :func:`foreign_source`.
     """
-    if resolved.artefact is not None:
-        return source_in(resolved.artefact, resolved.output)
+    if resolved.artefact is None:
+        return foreign_source(resolved.path)
+    return source_in(resolved.artefact, resolved.output)
+
+
+def foreign_source(path: Path) -> Source:
+    """A file or a directory outside the store as a stage's input.
+
+    Raises:
+        UsageError: a directory without files, or a path that cannot be read.
+        IntegrityError: a directory that holds links, pipes or names that no output can have.
+    """
     try:
-        if resolved.path.is_file():
-            return Source(resolved.path, file_digest(resolved.path))
-        outputs = directory_outputs(resolved.path)
+        if path.is_file():
+            return Source(path, file_digest(path))
+        outputs = directory_outputs(path)
         if not outputs:
-            raise UsageError(f"{resolved.path} holds no files", "name a file or an artefact")
-        return Source(resolved.path, content_digest(outputs))
+            raise UsageError(f"{path} holds no files", "name a file or an artefact")
+        return Source(path, content_digest(outputs))
     except OSError as error:
         raise UsageError(
-            f"{resolved.path} cannot be read ({error.strerror})", "name a file or an artefact"
+            f"{path} cannot be read ({error.strerror})", "name a file or an artefact"
         ) from None
     except ValueError as error:
         raise IntegrityError(
-            f"{resolved.path}: {error}", "name a directory of plain files, or an artefact"
+            f"{path}: {error}", "name a directory of plain files, or an artefact"
         ) from None

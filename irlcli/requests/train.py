@@ -6,7 +6,7 @@ from irlcli.configs.load import unseen_settings
 from irlcli.data import descriptions
 from irlcli.errors import UsageError
 from irlcli.experiments.references import demonstrations
-from irlcli.experiments.status import source_of
+from irlcli.experiments.status import source_in
 from irlcli.interventions import check_tabular, parse_setting
 from irlcli.methods import METHODS
 from irlcli.penalties import maxent_methods
@@ -17,7 +17,7 @@ from irlcli.stages import clone as clone_stage
 from irlcli.stages import train_airl as airl_stage
 from irlcli.stages import train_maxent as maxent_stage
 from irlcli.stages.base import Request, Source
-from irlcli.store import Resolved, read_json
+from irlcli.store import read_json
 
 
 def train_airl(
@@ -95,7 +95,7 @@ def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | N
     tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
     tried = ",".join(f"{weight:g}" for weight in found.weights)
     session.console.say(f"lambda {found.chosen:g} was the best of {tried}{tied} ({path})")
-    return found.chosen, source_of(Resolved(made, path))
+    return found.chosen, source_in(made, "choice.json")
 
 
 def train_maxent(

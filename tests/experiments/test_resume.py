@@ -170,10 +170,9 @@ def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count, gap):
 def test_a_foreign_input_that_changes_after_planning_is_noticed(tmp_path):
     from irlcli.configs import load_config
     from irlcli.errors import IntegrityError
-    from irlcli.experiments.status import source_of
+    from irlcli.experiments.status import foreign_source
     from irlcli.interventions import parse_settings
     from irlcli.stages import evaluate
-    from irlcli.store import Resolved
 
     path = tmp_path / "policy.pt"
     path.write_bytes(b"one")
@@ -182,7 +181,7 @@ def test_a_foreign_input_that_changes_after_planning_is_noticed(tmp_path):
         "lunar-lander",
         parse_settings("lunar-lander", "bounce=0.9"),
         config.evaluation,
-        source_of(Resolved(None, path)),
+        foreign_source(path),
     )
     path.write_bytes(b"two")
     with pytest.raises(IntegrityError, match=r"policy\.pt changed"):
