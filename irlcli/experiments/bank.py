@@ -21,18 +21,20 @@ from irlcli.stages.base import From, Request, Source
 from irlcli.store import Artefact, Store
 
 
-class Retrained(NamedTuple):
-    """A policy that was retrained on the reward, and how.
+class Member(NamedTuple):
+    """A policy of a bank.
 
     Attributes:
-        ceiling: of the rewards it was trained on; None without.
-        from_student: whether it began as the reward's student.
+        policy: None for an agent without one.
+        noise: that is added to its actions.
+        ceiling: of the rewards it was retrained on; None without.
     """
 
     name: str
-    policy: Source | From
+    kind: str
+    policy: Source | From | None = None
+    noise: float = 0.0
     ceiling: float | None = None
-    from_student: bool = False
 
 
 class Policies(NamedTuple):
@@ -50,7 +52,7 @@ class Policies(NamedTuple):
     student: Source | From | None
     reused: Mapping[str, Source | From]
     experts: Mapping[str, Source | From]
-    retrained: Mapping[str, Sequence[Retrained]]
+    retrained: Mapping[str, Sequence[Member]]
 
 
 def bank(
@@ -76,31 +78,21 @@ def bank(
     return found
 
 
-class _Member(NamedTuple):
-    name: str
-    kind: str
-    policy: Source | From | None = None
-    noise: float = 0.0
-    ceiling: float | None = None
-
-
-def _members(place: str, config: Config, policies: Policies) -> Iterator[_Member]:
-    yield _Member("idle", "idle")
-    yield _Member("random", "random")
+def _members(place: str, config: Config, policies: Policies) -> Iterator[Member]:
+    yield Member("idle", "idle")
+    yield Member("random", "random")
     if policies.clone is not None:
         for noise in dict.fromkeys(config.assessment.noise):
-            yield _Member(f"clone, noise {noise}", "clone", policies.clone, noise)
+            yield Member(f"clone, noise {noise}", "clone", policies.clone, noise)
     if policies.student is not None:
-        yield _Member("student", "student", policies.student)
+        yield Member("student", "student", policies.student)
     for trained, expert in policies.reused.items():
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         if trained != place and expert != policies.experts.get(place):
-            yield _Member(f"expert of {trained}", "reused", expert)
+            yield Member(f"expert of {trained}", "reused", expert)
     if place in policies.experts:
-        yield _Member(f"expert of {place}", "expert", policies.experts[place])
-    for name, policy, ceiling, from_student in policies.retrained.get(place, ()):
-        kind = "from-student" if from_student else "retrained"
-        yield _Member(name, kind, policy, ceiling=ceiling)
+        yield Member(f"expert of {place}", "expert", policies.experts[place])
+    yield from policies.retrained.get(place, ())
 
 
 class Finder:
@@ -195,7 +187,7 @@ class Finder:
         except NotFound:
             return None
 
-    def _retrained(self, reward: Source, place: str) -> list[Retrained]:
+    def _retrained(self, reward: Source, place: str) -> list[Member]:
         found = []
         for artefact in self._index.artefacts.values():
             record_ = artefact.manifest.record
@@ -207,5 +199,6 @@ class Finder:
                 name = f"retrained {artefact.id[:8]} {labels.retrained_as(record_)}".strip()
                 policy = source_in(artefact, "policy.pt")
                 ceiling = record_.parameters["transfer"].get("ceiling")
-                found.append(Retrained(name, policy, ceiling, "start" in record_.inputs))
-        return sorted(found)
+                kind = "from-student" if "start" in record_.inputs else "retrained"
+                found.append(Member(name, kind, policy, ceiling=ceiling))
+        return sorted(found, key=lambda member: member.name)

@@ -26,7 +26,7 @@ from irlcli import labels
 from irlcli.data import descriptions
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
-from irlcli.experiments.bank import Policies, Retrained, bank
+from irlcli.experiments.bank import Member, Policies, bank
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
 from irlcli.experiments.variants import Configs
@@ -297,17 +297,17 @@ def _run(
     yield Task(run.name, "rewards", learned)
     reward = _Reward(requests, demos, learned, run, measures)
     yield from _imitation(reward, {"reward-learning": learned})
-    retrained: dict[str, list[Retrained]] = {}
+    retrained: dict[str, list[Member]] = {}
     for measure in (measure for measure in RETRAINED if measure in measures):
         for retraining in range(retrainings):
             for place in trained if measure == "transfer-id" else requests.unseen:
                 moved = _retraining(reward, measure, place, retraining)
                 yield from _retrained(reward, moved, measure, place, retraining)
-                member = Retrained(
+                member = Member(
                     _known_as(measure, retraining),
+                    "from-student" if measure == "from-student" else "retrained",
                     From(moved, "policy.pt"),
-                    moved.parameters.transfer.ceiling,
-                    measure == "from-student",
+                    ceiling=moved.parameters.transfer.ceiling,
                 )
                 retrained.setdefault(str(place), []).append(member)
     if "transfer" in measures:
@@ -348,7 +348,7 @@ def _expert_by_reward(reward: _Reward) -> Task:
     return Task(f"{reward.run.name}.expert-by-reward", "returns", request, cell)
 
 
-def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Retrained]]) -> Iterator[Task]:
+def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Member]]) -> Iterator[Task]:
     """The bank of a row's policies, and how well the reward ranks them.
 
     It has the unseen setting only where another measure does.
