@@ -6,7 +6,7 @@ inside ``run`` only.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -17,6 +17,8 @@ from irlcli.interventions import Setting
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from irlcli.data.descriptions import Reward
     from irlcli.learners.frozen import FrozenReward
     from irlcli.learners.reward_model import RewardModule
@@ -300,14 +302,22 @@ def summary_of(setting: str, trajectories: "Sequence[Trajectory]") -> dict[str, 
     import numpy as np
 
     returns = np.array([t.episode_return for t in trajectories])
-    progress = float(np.mean([t.progress for t in trajectories]))
+    lengths = np.array([len(t) for t in trajectories])
+    return means_of(setting, returns, lengths, float(np.mean([t.progress for t in trajectories])))
+
+
+def means_of(
+    setting: str, returns: "np.ndarray | None", lengths: "np.ndarray", progress: float = nan
+) -> dict[str, Any]:
+    """The means over episodes in one setting. ``returns`` are None where they are unknown."""
+    several = len(lengths) > 1
     return {
         "setting": setting,
-        "episodes": len(returns),
-        "mean_return": float(returns.mean()),
-        "std_return": float(returns.std(ddof=1)) if len(returns) > 1 else None,
-        "mean_progress": None if np.isnan(progress) else progress,
-        "mean_length": float(np.mean([len(t) for t in trajectories])),
+        "episodes": len(lengths),
+        "mean_return": None if returns is None else float(returns.mean()),
+        "std_return": float(returns.std(ddof=1)) if returns is not None and several else None,
+        "mean_progress": None if isnan(progress) else progress,
+        "mean_length": float(lengths.mean()),
     }
 
 

@@ -9,7 +9,7 @@ import msgspec
 from irlcli.configs import Config, MaxEntConfig
 from irlcli.interventions import Setting
 from irlcli.stages import sweep_maxent
-from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage
 from irlcli.stages.sweep_maxent import (
     FIGURE2_PENALTIES,
     PAPER_L2,
@@ -41,15 +41,16 @@ def request(
         UsageError: as :func:`irlcli.stages.sweep_maxent.request`.
     """
     sweep = sweep_maxent.request(env, settings, unseen, config)
-    seed, drawn = next(iter(sweep_maxent.datasets(env, settings, config).items()))
+    p: sweep_maxent.Parameters = sweep.parameters
+    seed = p.seeds[0]
     parameters = Parameters(
-        environment=environment_key(env),
-        settings=tuple(str(s) for s in settings),
-        unseen=tuple(str(s) for s in unseen),
+        environment=p.environment,
+        settings=p.settings,
+        unseen=p.unseen,
         seed=seed,
-        shared=sweep_maxent.shared_config(config),
+        shared=p.shared,
     )
-    inputs = {"sweep": From(sweep), "demonstrations": From(drawn)}
+    inputs = {"sweep": From(sweep), "demonstrations": sweep.inputs[f"demonstrations {seed}"]}
     return Request(STAGE, parameters, inputs, f"figure2 {env}")
 
 

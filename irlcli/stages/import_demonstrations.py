@@ -11,7 +11,15 @@ import msgspec
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, parse_setting
-from irlcli.stages.base import EnvironmentKey, Job, Request, Source, Stage, environment_key
+from irlcli.stages.base import (
+    EnvironmentKey,
+    Job,
+    Request,
+    Source,
+    Stage,
+    environment_key,
+    means_of,
+)
 
 if TYPE_CHECKING:
     from irlcli.data.exchange.expected import Expected
@@ -177,16 +185,8 @@ def _report(job: Job, irregular: Irregular, written: Written) -> None:
 def _means(index: int, text: str, written: Written) -> dict[str, Any]:
     """The means of the episodes in one setting, as ``summary.json`` has them."""
     mine = written.settings == index
-    returns = written.returns[mine]
-    several = written.rewarded and len(returns) > 1
-    return {
-        "setting": text,
-        "episodes": len(returns),
-        "mean_return": float(returns.mean()) if written.rewarded else None,
-        "std_return": float(returns.std(ddof=1)) if several else None,
-        "mean_progress": None,
-        "mean_length": float(written.lengths[mine].mean()),
-    }
+    returns = written.returns[mine] if written.rewarded else None
+    return means_of(text, returns, written.lengths[mine])
 
 
 STAGE = Stage("import", 1, run, reads=())

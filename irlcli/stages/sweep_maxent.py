@@ -50,7 +50,7 @@ class SweepVariant(msgspec.Struct, frozen=True, kw_only=True):
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the sweep depends on, besides its datasets (``seeds``, in the order of the inputs).
 
-    ``shared`` is :func:`shared_config`.
+    ``shared`` has the hyperparameters of all variants; what they replace is at its default.
     """
 
     environment: EnvironmentKey
@@ -79,7 +79,7 @@ def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[Sw
     return tuple(found)
 
 
-def shared_config(config: Config) -> MaxEntConfig:
+def _shared(config: Config) -> MaxEntConfig:
     """The hyperparameters of all variants; what the variants replace is at its default."""
     penalised = SweepVariant(
         grouping="per-setting", penalty=FIGURE2_PENALTIES[0], penalty_weight=1.0
@@ -88,7 +88,7 @@ def shared_config(config: Config) -> MaxEntConfig:
     return replace(relevant, **asdict(SweepVariant(grouping="pooled")))
 
 
-def datasets(env: str, settings: Sequence[Setting], config: Config) -> dict[int, Request]:
+def _datasets(env: str, settings: Sequence[Setting], config: Config) -> dict[int, Request]:
     """The demonstrations that the sweep learns from, by seed."""
     f: Figure2Config = config.figure2
     return {
@@ -110,7 +110,7 @@ def request(
     """
     check_tabular(env, "sweep-maxent", wanted=True)
     texts = tuple(str(s) for s in settings)
-    requests = datasets(env, settings, config)
+    requests = _datasets(env, settings, config)
     parameters = Parameters(
         environment=environment_key(env),
         settings=texts,
@@ -118,7 +118,7 @@ def request(
         seeds=tuple(requests),
         variants=variants(config.figure2.penalty_weights, config.figure2.l2s),
         gridworld=config.gridworld,
-        shared=shared_config(config),
+        shared=_shared(config),
     )
     inputs = {f"demonstrations {seed}": From(demos) for seed, demos in requests.items()}
     label = f"sweep-maxent {env} {', '.join(texts)} {len(requests)} datasets"
