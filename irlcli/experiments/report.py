@@ -13,7 +13,7 @@ from irlcli.configs import ExpertConfig
 from irlcli.errors import NotFound
 from irlcli.experiments import facts
 from irlcli.experiments.plan import Plan
-from irlcli.experiments.rows import Task, made_by
+from irlcli.experiments.rows import made_by
 from irlcli.experiments.status import source_in
 from irlcli.interventions import listed_settings
 from irlcli.report.parameters import ASSESS, CUE, Cell, Row
@@ -99,7 +99,7 @@ def _cells(plan: Plan) -> tuple[list[Cell], dict[str, Source]]:
     for task in plan.cells:
         cell = task.cell
         assert cell is not None
-        artefact = _held(plan, task.request) or _without_reward(plan, task)
+        artefact = _held(plan, task.request)
         if artefact is None:
             cells.append(msgspec.structs.replace(cell, why=_reason(plan, task.request)))
         else:
@@ -116,18 +116,6 @@ def _held(plan: Plan, request: Request) -> Artefact | None:
     """The request's artefact, if it is in the store itself."""
     step = plan.lookup(request)
     return step.artefact if step.status == "HIT" else None
-
-
-def _without_reward(plan: Plan, task: Task) -> Artefact | None:
-    """An evaluation of a retrained policy that did not score it by the reward.
-
-    Its true returns are the same.
-    """
-    if task.cell is None or task.cell.measure != "transfer":
-        return None
-    inputs = {"policy": task.request.inputs["policy"]}
-    parameters = msgspec.structs.replace(task.request.parameters, ceiling=None)
-    return _held(plan, task.request._replace(inputs=inputs, parameters=parameters))
 
 
 def _reason(plan: Plan, request: Request) -> str:
@@ -149,13 +137,8 @@ def _curve_role(cell: Cell, part: str) -> str:
 
 def _artefacts(plan: Plan) -> dict[str, Artefact]:
     """Everything the report is made from, by id."""
-    found: dict[str, Artefact] = {}
     held = [_held(plan, task.request) for task in plan.tasks.values()]
-    held += [_without_reward(plan, task) for task in plan.cells if not _held(plan, task.request)]
-    for artefact in held:
-        if artefact is not None:
-            found[artefact.id] = artefact
-    return found
+    return {artefact.id: artefact for artefact in held if artefact is not None}
 
 
 def _rows(plan: Plan) -> list[Row]:

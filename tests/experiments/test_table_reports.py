@@ -185,32 +185,6 @@ def test_experts_are_evaluated_in_the_other_settings_too(report, irl, table_stor
     assert re.search(r"^expert of engine-power=1x +lunar-lander engine-power=1.25x ", said, re.M)
 
 
-def test_a_transfer_evaluated_without_its_reward_counts_too(report, irl, table_store, tmp_path):
-    copy = tmp_path / "runs"
-    shutil.copytree(table_store, copy, symlinks=True)
-    store = Store(copy)
-    common = ["--store", copy, "--profile", "smoke", *SMALL]
-    scored = store.resolve("erm.0.transfer-returns").artefact
-    assert irl("evaluate", "--policy", "erm.0.transfer", *common).code == 0
-    with_reward = Path(report("table1", copy, *ROW).out.strip())
-    shutil.rmtree(scored.directory)
-    without = Path(report("table1", copy, *ROW).out.strip())
-    tables = [json.loads((d / "table1.json").read_text()) for d in (with_reward, without)]
-    cells = [
-        next(
-            c
-            for c in t["cells"]
-            if (c["agent"], c["measure"]) == ("erm", "transfer") and c["seeds"]
-        )
-        for t in tables
-    ]
-    assert cells[0]["mean"] == cells[1]["mean"] and cells[1]["seeds"] == 2
-    assert [[r["seeds"] for r in t["learned_returns"] if r["agent"] == "erm"] for t in tables] == [
-        [2],
-        [1],
-    ]
-
-
 def test_the_learning_curve_of_a_retrained_policy_is_that_of_the_restart_kept(
     report, irl, table_store, tmp_path, monkeypatch
 ):
