@@ -43,7 +43,7 @@ class StageCheckpoints:
             self.discard(str(error))
 
     def load(self) -> bytes | None:
-        """The state to resume from; None at the first attempt."""
+        """The state to resume from; None without a usable checkpoint."""
         return self._state
 
     def discard(self, reason: str) -> None:

@@ -117,7 +117,7 @@ class _Child:
 
 
 class Execution:
-    """The making of what a plan is missing, which also names all artefacts.
+    """Runs what a plan is missing, each step in a process of its own, and names all artefacts.
 
     Args:
         plan: what to make.
@@ -254,7 +254,7 @@ class Execution:
             pass
 
     def _stop(self) -> None:
-        """Pass the signals on that the processes have not had yet."""
+        """Forward a signal to every process: SIGTERM for the first one, SIGKILL for the second."""
         if not self._passed_on:
             self._display.stopping()
         for child in self._running.values():

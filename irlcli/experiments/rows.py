@@ -93,7 +93,7 @@ class RewardRun(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Candidates for lambda, and the store that knows which was chosen; ``own``: each penalty's."""
+    """Candidates for lambda, ``own`` for those of each penalty, and where the chosen one is found."""
 
     candidates: Sequence[float] | Literal["own"]
     lookup: Lookup

@@ -162,6 +162,7 @@ class Runner:
     def _obtain(
         self, request: Request, record: KeyRecord, sources: Mapping[str, Source]
     ) -> Artefact:
+        # The command line collects no garbage, but a stage runs long.
         gc.enable()
         on_wait = partial(self.console.wait, request.label)
         with self.store.working_on(record.key, self.wait, on_wait) as scratch:

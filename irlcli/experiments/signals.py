@@ -8,7 +8,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def stop_requests(handle: Callable[[], None]) -> Iterator[None]:
-    """Call ``handle`` at every SIGINT and SIGTERM, and at a SIGUSR2 before them.
+    """Call ``handle`` at the first SIGINT, SIGTERM or SIGUSR2.
+
+    It is called again at each SIGINT or SIGTERM that follows another of these two.
 
     A cluster's warning before a time limit or a preemption arrives as SIGUSR2, as SIGTERM or as
     both, and from the job as well as from the process that passes it on. It counts once.

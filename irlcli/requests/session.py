@@ -209,7 +209,7 @@ class StageSession(Session):
     def prepare(self, request: "Request", output: str) -> tuple[Artefact, Path] | None:
         """The artefact of ``request`` and its file ``output``; ``train-airl`` depends on them.
 
-        None if nothing may be run, and it is missing.
+        The command line's session returns None with --dry-run if the artefact is missing.
         """
         self.prepared.append(request)
         (made,) = self.run([request])

@@ -62,9 +62,9 @@ def request(
     Outputs ``choice.json``.
 
     Raises:
-        UsageError: fewer than two settings or weights (or than three settings, for a penalty that
-            compares them and for shuffled ones), a method without penalty, or a round that is selected by one of the
-            settings.
+        UsageError: fewer than two weights; fewer than two settings, or than three if the penalty
+            compares settings or their labels are shuffled; a method without penalty; a round that
+            is selected by one of the settings.
     """
     texts = tuple(str(s) for s in settings)
     candidates = _candidates(airl, texts, weights)

@@ -1,7 +1,7 @@
 """What was submitted: a directory per submission in the store, with the jobs' logs.
 
-Another ``irl run`` reads them, by whomever and for whichever table, so that no step that is in the
-queue is submitted again.
+Every later ``irl run`` on this store reads them, so that no step that is in the queue is submitted
+again.
 """
 
 import json
@@ -25,7 +25,7 @@ _LONGEST_LINE = 1000
 
 
 class Submitted(NamedTuple):
-    """A job: the step it makes, what that step is, whatever its name, and its id."""
+    """A job: the name of its step, the digest of its request (``Plan.identities``), and its id."""
 
     name: str
     identity: str

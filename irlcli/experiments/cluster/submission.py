@@ -194,7 +194,7 @@ class Submission:
             if step.status == "HIT" and step.artefact is not None:
                 self._runner.store.set_name(name, step.artefact)
         if self._outcome.copied and any(map(self._plan.chooses, self._plan.tasks)):
-            # A copied choice, or one that another run has just made.
+            # A copied step may choose a lambda. What other runs made meanwhile is seen as well.
             self._plan.refresh()
 
     def _exists(self, name: str) -> bool:
