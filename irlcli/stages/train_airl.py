@@ -7,7 +7,7 @@ from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
 from irlcli import labels
@@ -46,10 +46,10 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     seed: int
     airl: AIRLConfig
-    penalty_version: int | msgspec.UnsetType = msgspec.UNSET
-    selection_version: int | msgspec.UnsetType = msgspec.UNSET
+    penalty_version: int | UnsetType = UNSET
+    selection_version: int | UnsetType = UNSET
     # 2: what is left over of every setting is dealt to the same groups.
-    dealing_version: Literal[2] | msgspec.UnsetType = msgspec.UNSET
+    dealing_version: Literal[2] | UnsetType = UNSET
 
 
 def request(
@@ -112,10 +112,10 @@ def request(
         airl=relevant,
         penalty_version=penalty_version(relevant.penalty),
         selection_version=_selection_version(relevant),
-        dealing_version=2 if relevant.grouping == "shuffled" else msgspec.UNSET,
+        dealing_version=2 if relevant.grouping == "shuffled" else UNSET,
     )
-    check_risks(parameters.airl.penalty, parameters.airl.grouping, trained)
-    label = f"train-airl {describe(parameters.airl)} {env} {', '.join(texts)} seed {seed}"
+    check_risks(relevant.penalty, relevant.grouping, trained)
+    label = f"train-airl {describe(relevant)} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, {"demonstrations": demos, **(basis or {})}, label)
 
 
@@ -134,10 +134,10 @@ def reward_label(airl: AIRLConfig, seed: int) -> str:
     return f"{describe(airl)} seed {seed}"
 
 
-def _selection_version(airl: AIRLConfig) -> int | msgspec.UnsetType:
+def _selection_version(airl: AIRLConfig) -> int | UnsetType:
     """In keys where a round is selected from those with a penalty."""
     # 2: none is selected before lambda has its full value.
-    return 2 if airl.select != "last" and airl.penalty != "none" else msgspec.UNSET
+    return 2 if airl.select != "last" and airl.penalty != "none" else UNSET
 
 
 def _check_selection(airl: AIRLConfig, settings: Sequence[str]) -> None:
@@ -374,7 +374,7 @@ def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping
     from irlcli.learners.stopping import cross_entropies, plateaued
 
     def stop(rows: Sequence[Mapping[str, Any]]) -> bool:
-        if isinstance(airl.plateau_rounds, msgspec.UnsetType):
+        if isinstance(airl.plateau_rounds, UnsetType):
             return False
         # Until then the loss itself changes.
         first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds

@@ -75,8 +75,8 @@ def request(
         maxent=relevant,
         penalty_version=penalty_version(relevant.penalty),
     )
-    check_risks(parameters.maxent.penalty, parameters.maxent.grouping, len(texts))
-    label = f"train-maxent {describe(parameters.maxent)} {env} {', '.join(texts)} seed {seed}"
+    check_risks(relevant.penalty, relevant.grouping, len(texts))
+    label = f"train-maxent {describe(relevant)} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, {"demonstrations": demos}, label)
 
 
