@@ -100,7 +100,10 @@ def plan(
 
 
 def _print_plan(session: StageSession, choice: TableChoice, plan: "Plan") -> None:
-    steps, counts = steps_of(plan), plan.counts()
+    from irlcli.experiments.status import STATUSES
+
+    steps = steps_of(plan)
+    counts = {status: sum(s["status"] == status for s in steps) for status in STATUSES}
     if session.as_json:
         command = _child_words(session, choice, plan)
         for step in steps:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from queue import Empty, SimpleQueue
@@ -81,7 +82,7 @@ class _Child:
     def __init__(self, name: str, command: Sequence[str], lines: SimpleQueue):
         self.name = name
         self.started = time.monotonic()
-        self.last: list[str] = []
+        self.last: deque[str] = deque(maxlen=LAST_LINES)
         # A process group of its own: Ctrl-C on the terminal reaches it through this process only.
         self.process = subprocess.Popen(
             command,
@@ -97,7 +98,7 @@ class _Child:
         assert self.process.stderr is not None
         for raw in self.process.stderr:
             text = raw.decode("utf-8", "replace").rstrip()
-            self.last = [*self.last[-LAST_LINES:], text]
+            self.last.append(text)
             lines.put((self.name, text))
 
     def stop(self, at_once: bool) -> None:

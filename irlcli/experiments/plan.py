@@ -1,6 +1,5 @@
 """A table as a list of named steps, and what a store holds of each."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Any, Literal, NamedTuple
@@ -9,7 +8,7 @@ from irlcli.configs import Config
 from irlcli.errors import UsageError, closest
 from irlcli.experiments import figures, rows
 from irlcli.experiments.rows import PHASES, Chosen, RewardRun, Task
-from irlcli.experiments.status import STATUSES, Identities, Lookup, Step, waiting
+from irlcli.experiments.status import Identities, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
 from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
 from irlcli.stages import choose_penalty
@@ -178,11 +177,6 @@ class Plan:
     def chooses(self, name: str) -> bool:
         """Whether the step chooses a lambda: once it exists, later requests differ (:meth:`refresh`)."""
         return self.tasks[name].request.stage == choose_penalty.STAGE
-
-    def counts(self) -> dict[str, int]:
-        """How many steps have each status."""
-        found = Counter(self.lookup(task.request).status for task in self.tasks.values())
-        return {status: found[status] for status in STATUSES}
 
 
 def _cached(configs: Configs) -> Configs:

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -69,7 +70,7 @@ class StepJob(NamedTuple):
         note.write_text(json.dumps(failure(code, lines)._asdict()))
         raise StepFailed(f"{self.name} ended with exit code {code}")
 
-    def _run(self) -> tuple[int, list[str], list[int]]:
+    def _run(self) -> tuple[int, deque[str], list[int]]:
         """The command's exit code, its last lines, and the signals that were passed on to it."""
         process = subprocess.Popen(
             self.command,
@@ -89,11 +90,11 @@ class StepJob(NamedTuple):
 
         for number in (signal.SIGUSR2, signal.SIGTERM):
             signal.signal(number, stop)
-        lines: list[str] = []
+        lines: deque[str] = deque(maxlen=LAST_LINES)
         assert process.stderr is not None
         for line in process.stderr:
             print(line, end="", file=sys.stderr, flush=True)
-            lines = [*lines[-LAST_LINES:], line.rstrip()]
+            lines.append(line.rstrip())
         return process.wait(), lines, received
 
     def _turns(self) -> int:
