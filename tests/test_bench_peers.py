@@ -10,6 +10,7 @@ import pytest
 from benchmarks.peers.__main__ import enough, main
 from benchmarks.peers.absorbing import AbsorbingState
 from benchmarks.peers.checks import first_kept, share
+from benchmarks.peers.ours import requested
 from benchmarks.peers.results import read_run, tables, until_text, write
 from benchmarks.peers.tasks import METHODS, ROWS, chosen, tasks
 from irlcli.envs.lunar_lander.env import LunarLander
@@ -154,6 +155,17 @@ def test_an_absorbing_state_repeats_the_terminal_observation():
     observation, _ = absorbing.reset(seed=1)
     np.testing.assert_array_equal(observation, plain.reset(seed=1)[0])
     np.testing.assert_array_equal(absorbing.step(2)[0], plain.step(2)[0])
+
+
+@pytest.mark.parametrize("method", ["airl", "airl-plain"])
+def test_challengers_take_as_many_steps_as_they_are_trained_with(method, tmp_path):
+    run = {"method": method, "row": "half-cheetah.friction", "seed": 1}
+    run["settings"] = ["friction=1.5:0.1:0.1", "friction=2:0.6:0.6"]
+    request, steps = requested(run, tmp_path)
+    worlds = request.parameters.airl.ppo.n_envs
+    assert worlds == 18
+    # A round of a challenger is two rollouts of 512 steps.
+    assert steps == {"airl": worlds * 512 * 2, "airl-plain": 0}[method]
 
 
 def test_names_are_checked():

@@ -17,7 +17,7 @@ from irlcli.configs import load_config
 from irlcli.interventions import parse_setting
 from irlcli.rl.loop import Training
 from irlcli.stages import train_airl, train_expert
-from irlcli.stages.base import Job, Source
+from irlcli.stages.base import Job, Request, Source
 
 _OVERRIDES = {"airl-plain": ["airl.challenger.life=0"]}
 
@@ -44,23 +44,28 @@ class _NoCheckpoints:
         pass
 
 
-def main() -> None:
-    """Run the task that the first argument describes, as JSON."""
-    run = json.loads(sys.argv[1])
+def requested(run: dict[str, Any], demos: Path) -> tuple[Request, int]:
+    """The training that ``run`` describes, and the steps of its challengers in each round."""
     env = run["row"].split(".")[0]
     config = load_config(env, "standard", overrides=_OVERRIDES.get(run["method"], []))
     settings = [parse_setting(env, text) for text in run["settings"]]
+    if run["method"] == "expert":
+        setting = settings[0]
+        return train_expert.request(env, setting, run["seed"], config.expert_of(setting)), 0
+    # The defaults of grouping and penalty are ERM's.
+    airl = config.airl_of(settings)
+    request = train_airl.request(Source(demos, ""), env, settings, airl, run["seed"])
+    # As it is trained: the request gives it the student's number of worlds.
+    challenger = request.parameters.airl.challenger
+    return request, challenger.ppo.steps_per_round if challenger.life > 0 else 0
+
+
+def main() -> None:
+    """Run the task that the first argument describes, as JSON."""
+    run = json.loads(sys.argv[1])
     checks = Checks(run)
     demos = Path(run["dataset"])
-    challenger_steps = 0
-    if run["method"] == "expert":
-        request = train_expert.request(env, settings[0], run["seed"], config.expert_of(settings[0]))
-    else:
-        # The defaults of grouping and penalty are ERM's.
-        airl = config.airl_of(settings)
-        request = train_airl.request(Source(demos, ""), env, settings, airl, run["seed"])
-        if airl.challenger.life > 0:
-            challenger_steps = airl.challenger.ppo.steps_per_round
+    request, challenger_steps = requested(run, demos)
 
     def run_training(job: Job, training: Any) -> NoReturn:
         def after_round(training: Training, rows: Any) -> None:
