@@ -91,13 +91,12 @@ class _Shared:
     rewards: Any
     action_shape: tuple[int, ...]
     observation_shape: tuple[int, ...]
-    discrete: bool
+    action_dtype: np.dtype
 
     def views(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Actions, observations [N, D] float32 and rewards [N] float64 as numpy arrays."""
-        dtype = np.int64 if self.discrete else np.float64
         return (
-            np.frombuffer(self.actions, dtype=dtype).reshape(self.action_shape),
+            np.frombuffer(self.actions, dtype=self.action_dtype).reshape(self.action_shape),
             np.frombuffer(self.observations, dtype=np.float32).reshape(self.observation_shape),
             np.frombuffer(self.rewards, dtype=np.float64),
         )
@@ -128,7 +127,8 @@ def _work(
                 seeds = channel.receive()
                 ended: list[Ended] = []
                 if seeds is None:
-                    observations[:], rewards[:], ended = worlds.step(actions)
+                    # A copy: an environment may keep its last action.
+                    observations[:], rewards[:], ended = worlds.step(actions.copy())
                 else:
                     observations[:] = worlds.reset(seeds)
                 ended = [replace(end, world=worker + workers * end.world) for end in ended]
@@ -181,13 +181,16 @@ class WorkerWorlds:
         self._size = len(factories)
         action_shape = (self._size, *(self.action_space.shape or ()))
         observation_shape = (self._size, *(self.observation_space.shape or ()))
+        # Environments compute in their action's type, so it is the one that policies return.
+        continuous = isinstance(self.action_space, gymnasium.spaces.Box)
+        action_dtype = np.dtype(self.action_space.dtype if continuous else np.int64)
         shared = _Shared(
-            RawArray("d", int(np.prod(action_shape))),
+            RawArray("b", int(np.prod(action_shape)) * action_dtype.itemsize),
             RawArray("f", int(np.prod(observation_shape))),
             RawArray("d", self._size),
             action_shape,
             observation_shape,
-            not isinstance(self.action_space, gymnasium.spaces.Box),
+            action_dtype,
         )
         self._actions, self._observations, self._rewards = shared.views()
         # A forked process would inherit its siblings' pipe ends and keep them open, which would

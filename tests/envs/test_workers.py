@@ -74,7 +74,8 @@ def roll_out(worlds, steps: int = 12) -> list:
     random = np.random.default_rng(0)
     out = [worlds.reset(SEEDS)]
     for _ in range(steps):
-        observations, rewards, ended = worlds.step(random.normal(size=(3, 6)) * 0.5)
+        actions = random.normal(size=(3, 6)) * 0.5
+        observations, rewards, ended = worlds.step(actions.astype(np.float32))
         assert observations.dtype == np.float32
         assert rewards.dtype == np.float64
         out += [observations, rewards]
@@ -92,6 +93,30 @@ def test_results_do_not_depend_on_the_number_of_workers():
         assert len(actual) == len(expected)
         for a, b in zip(actual, expected, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+class Smooth(gymnasium.Env):
+    """Computes in its action's type, and keeps its last action."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.last = np.zeros(6, dtype=np.float32)
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action):
+        change = np.sum((action - self.last) ** 2)
+        self.last = action
+        return np.zeros(1, dtype=np.float32), float(change), False, False, {}
+
+
+def test_environments_get_actions_of_the_same_type_and_may_keep_them():
+    expected = roll_out(VectorWorlds([Smooth() for _ in range(3)], max_episode_steps=5))
+    actual = roll_out(WorkerWorlds([Smooth] * 3, max_episode_steps=5, workers=2))
+    for a, b in zip(actual, expected, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_has_the_environments_spaces_and_number():
