@@ -26,7 +26,7 @@ from msgspec.structs import replace
 from benchmarks.airl import build
 from irlcli.configs import load_config
 from irlcli.interventions import parse_settings
-from irlcli.rl.loop import LastRound, Training
+from irlcli.rl.loop import Training
 from irlcli.rl.rollout import roll_out
 from irlcli.rl.worlds import make_worlds
 
@@ -82,7 +82,7 @@ def measure(rounds: int, settings: int, worlds: int, demonstrations: int) -> dic
     where = make_worlds(ENV, parsed, worlds)
     trainer, learner, challengers = build(ENV, where, demos, config)
     texts = [str(setting) for setting in parsed]
-    training = Training(trainer, learner, learner, LastRound(), texts, challengers)
+    training = Training(trainer, learner, texts, learner, challengers=challengers)
     started = time.process_time()
     training.run(lambda *_: None, print)
     seconds = time.process_time() - started

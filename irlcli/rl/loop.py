@@ -89,60 +89,15 @@ class Selector(Protocol):
         """Continue from ``state_dict()``."""
 
 
-class NoLearner:
-    """The reward does not change: of an expert, or of a policy on a frozen reward."""
-
-    def __init__(self, settings: int):
-        self._settings = settings
-
-    def begin(self, trainer: Trainer) -> None:
-        """Change nothing."""
-
-    def update(
-        self,
-        index: int,
-        rollouts: Sequence[Rollout],
-        policy: Policy,
-        challenge: Sequence[Rollout],
-    ) -> list[dict[str, float]]:
-        """Learn nothing."""
-        return [{} for _ in range(self._settings)]
-
-    def state_dict(self) -> State:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: State) -> None:
-        """Nothing to load."""
-
-
-class LastRound:
-    """Keeps the last round."""
-
-    def consider(self, index: int, policy: Policy) -> dict[str, float]:
-        """No score."""
-        return {}
-
-    def restore(self, policy: Policy) -> None:
-        """The last round's networks are in place."""
-
-    def state_dict(self) -> State:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: State) -> None:
-        """Nothing to load."""
-
-
 class Training:
     """A training run: its parts, the rounds done, and one row of metrics per round and setting.
 
     Args:
         trainer: the policy and its algorithm.
         source: the policy's rewards.
-        learner: learns from every round's rollouts.
-        selector: chooses the round that is kept.
         settings: of the worlds, in their order.
+        learner: learns from every round's rollouts; none if the reward is fixed.
+        selector: chooses the round that is kept; without one it is the last.
         challengers: whose rollouts the learner learns from, too.
         ends: whether training ends before the trainer's last round, by the rows so far.
     """
@@ -151,17 +106,17 @@ class Training:
         self,
         trainer: Trainer,
         source: RewardSource,
-        learner: Learner,
-        selector: Selector,
         settings: Sequence[str],
+        learner: Learner | None = None,
+        selector: Selector | None = None,
         challengers: Challengers | None = None,
         ends: Callable[[Sequence[Row]], bool] = lambda rows: False,
     ):
         self.trainer = trainer
         self.source = source
+        self.settings = list(settings)
         self.learner = learner
         self.selector = selector
-        self.settings = list(settings)
         self.challengers = challengers
         self._ends = ends
         self.rounds_done = 0
@@ -199,7 +154,7 @@ class Training:
         ``after_round`` gets each round's rows. After the round that reaches ``until`` environment
         steps training stops, with the networks of that round; another call continues it.
         """
-        if self.rounds_done == 0:
+        if self.learner is not None and self.rounds_done == 0:
             self.learner.begin(self.trainer)
         for index in range(self.rounds_done, self.trainer.rounds):
             # Here, not at the end: a resumed run may have been killed after its last round.
@@ -209,8 +164,11 @@ class Training:
                 return self.rows
             rollouts = self.trainer.train_round(index, self.source)
             challenge = [] if self.challengers is None else self.challengers.train_round(index)
-            diagnostics = self.learner.update(index, rollouts, self.trainer.policy, challenge)
-            score = self.selector.consider(index, self.trainer.policy)
+            policy = self.trainer.policy
+            diagnostics: list[dict[str, float]] = [{}] * len(self.settings)
+            if self.learner is not None:
+                diagnostics = self.learner.update(index, rollouts, policy, challenge)
+            score = {} if self.selector is None else self.selector.consider(index, policy)
             rows = [
                 row | of_setting | of_challenger | score
                 for row, of_setting, of_challenger in zip(
@@ -228,7 +186,8 @@ class Training:
             ):
                 warn(message)
             after_round(self, rows)
-        self.selector.restore(self.trainer.policy)
+        if self.selector is not None:
+            self.selector.restore(self.trainer.policy)
         return self.rows
 
     def _of_challenger(self, index: int, challenge: Sequence[Rollout]) -> list[Row]:
@@ -253,23 +212,26 @@ class Training:
                     "episode ended there and training continues"
                 )
 
+    @property
+    def _parts(self) -> dict[str, Any]:
+        """What a checkpoint holds, by name."""
+        parts = {
+            "trainer": self.trainer,
+            "learner": self.learner,
+            "selector": self.selector,
+            "challengers": self.challengers,
+        }
+        return {name: part for name, part in parts.items() if part is not None}
+
     def state_dict(self) -> State:
         """What a resumed run needs, besides the rows."""
-        return {
-            "trainer": self.trainer.state_dict(),
-            "learner": self.learner.state_dict(),
-            "selector": self.selector.state_dict(),
-            **({} if self.challengers is None else {"challengers": self.challengers.state_dict()}),
-            "rounds_done": self.rounds_done,
-        }
+        states = {name: part.state_dict() for name, part in self._parts.items()}
+        return states | {"rounds_done": self.rounds_done}
 
     def load_state_dict(self, state: State, rows: Sequence[Row]) -> None:
         """Continue from ``state_dict()`` and the ``rows`` of that moment."""
-        self.trainer.load_state_dict(state["trainer"])
-        self.learner.load_state_dict(state["learner"])
-        self.selector.load_state_dict(state["selector"])
-        if self.challengers is not None:
-            self.challengers.load_state_dict(state["challengers"])
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
         self.rounds_done = int(state["rounds_done"])
         self.rows = list(rows)
 

@@ -33,7 +33,6 @@ from irlcli.stages.base import (
 if TYPE_CHECKING:
     from irlcli.learners.airl import AIRL
     from irlcli.learners.selection import BestRound
-    from irlcli.rl.loop import LastRound
     from irlcli.rl.worlds import Worlds
     from irlcli.symmetries import Symmetries
     from irlcli.trajectories import Trajectory
@@ -190,7 +189,6 @@ def run(job: Job) -> None:
     from irlcli.data.descriptions import Selected
     from irlcli.data.outputs import write_metrics, write_policy, write_reward
     from irlcli.learners.scoring import SMALLEST_SCALE
-    from irlcli.learners.selection import BestRound
     from irlcli.rl.challengers import Challengers
     from irlcli.rl.loop import Training
     from irlcli.rl.ppo import PPOTrainer
@@ -221,7 +219,7 @@ def run(job: Job) -> None:
                 theirs = [worlds_of([setting], share) for setting in parsed]
             challengers = Challengers(theirs, airl.challenger, learner, p.seed, STAGE.name)
         stop = _at_a_plateau(airl, len(settings))
-        training = Training(trainer, learner, learner, selector, settings, challengers, stop)
+        training = Training(trainer, learner, settings, learner, selector, challengers, stop)
         rows = run_training(job, training)
     if learner.scale <= SMALLEST_SCALE:
         job.console.warn("g is constant on the training data: no policy can be trained on it")
@@ -234,7 +232,7 @@ def run(job: Job) -> None:
     }
     write_policy(job.output, trainer.policy, airl.ppo, agent="student", **origin)
     selected = None
-    if isinstance(selector, BestRound):
+    if selector is not None:
         selected = Selected(round=selector.best["round"], score=selector.best["score"])
     write_reward(job.output, learner, airl=airl, selected=selected, stopped_after=stopped, **origin)
     write_metrics(job.output, rows)
@@ -340,18 +338,17 @@ def _symmetries(
 
 def _selector(
     p: Parameters, learner: AIRL, held_out: Sequence[Sequence[Trajectory]], rounds: int
-) -> LastRound | BestRound:
-    """What decides which round is kept, by ``airl.select``."""
+) -> BestRound | None:
+    """What decides which round is kept, by ``airl.select``; none keeps the last."""
     import numpy as np
 
     from irlcli.learners.discriminator import full_weight_from
     from irlcli.learners.selection import BestRound, log_likelihood
-    from irlcli.rl.loop import LastRound
     from irlcli.rl.rollout import roll_out
 
     airl = p.airl
     if airl.select == "last":
-        return LastRound()
+        return None
 
     def likelihood(policy: Any) -> float:
         return log_likelihood(policy, learner.view, held_out)

@@ -58,7 +58,7 @@ def demonstrator(env: str, setting: Setting, config: Config) -> Request:
 def run(job: Job) -> None:
     """Train; the metrics hold one row per round with the true return of the ended episodes."""
     from irlcli.data.outputs import write_metrics, write_policy
-    from irlcli.rl.loop import LastRound, NoLearner, Training
+    from irlcli.rl.loop import Training
     from irlcli.rl.ppo import PPOTrainer, TrueReward
     from irlcli.rl.worlds import make_worlds
 
@@ -67,7 +67,7 @@ def run(job: Job) -> None:
     settings = [parse_setting(env, p.setting)]
     with closing(make_worlds(env, settings, p.ppo.n_envs, job.workers)) as worlds:
         trainer = PPOTrainer(worlds, p.ppo, p.total_steps, p.seed, STAGE.name)
-        training = Training(trainer, TrueReward(), NoLearner(1), LastRound(), [p.setting])
+        training = Training(trainer, TrueReward(), [p.setting])
         rows = run_training(job, training)
     write_policy(
         job.output,

@@ -89,7 +89,7 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_metrics, write_policy
     from irlcli.data.tensors import load_reward_file
     from irlcli.rl import algorithm
-    from irlcli.rl.loop import LastRound, NoLearner, Training
+    from irlcli.rl.loop import Training
     from irlcli.rl.policy import require_observations
     from irlcli.rl.restarts import Restarts
     from irlcli.rl.worlds import make_worlds
@@ -118,7 +118,7 @@ def run(job: Job) -> None:
             )
             if student is not None:
                 trainer.policy.load_state_dict(student.state_dict())
-            return Training(trainer, reward, NoLearner(1), LastRound(), [p.setting])
+            return Training(trainer, reward, [p.setting])
 
         training: Training | Restarts
         if p.transfer.restarts is UNSET:

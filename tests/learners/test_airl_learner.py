@@ -23,7 +23,7 @@ from irlcli.learners.discriminator import measured
 from irlcli.learners.pools import Pool
 from irlcli.learners.replay import whole_episodes
 from irlcli.rl.challengers import Challengers
-from irlcli.rl.loop import LastRound, Training
+from irlcli.rl.loop import Training
 from irlcli.symmetries import Symmetries
 from irlcli.trajectories import join, transitions
 
@@ -304,7 +304,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(demos, changes):
             if learner.config.challenger.per_setting:
                 worlds = [worlds_of([setting], 4, HORIZON) for setting in SETTINGS]
             challengers = Challengers(worlds, learner.config.challenger, learner, 0, "test")
-        return Training(trainer, learner, learner, LastRound(), ["one", "other"], challengers)
+        return Training(trainer, learner, ["one", "other"], learner, challengers=challengers)
 
     saved = []
     through = training()

@@ -9,7 +9,7 @@ from airl_runs import make, random_episodes
 
 from irlcli.labels import describe
 from irlcli.learners.stopping import cross_entropies, plateaued
-from irlcli.rl.loop import LastRound, Training
+from irlcli.rl.loop import Training
 from irlcli.store import Store, read_json
 
 COIN = math.log(2.0)
@@ -49,7 +49,7 @@ def test_a_run_killed_after_its_last_round_trains_no_further():
     def training():
         trainer, learner = make(random_episodes(1), total_steps=3 * 8 * 64)
         ends = lambda rows: len(rows) >= 4  # noqa: E731
-        return Training(trainer, learner, learner, LastRound(), ["one", "other"], ends=ends)
+        return Training(trainer, learner, ["one", "other"], learner, ends=ends)
 
     saved = []
     rows = training().run(lambda t, _: saved.append((t.state_dict(), list(t.rows))), pytest.fail)

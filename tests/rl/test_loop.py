@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from irlcli.learners.selection import BestRound
-from irlcli.rl.loop import LastRound, NoLearner, Training
+from irlcli.rl.loop import Training
 from irlcli.trajectories import Rollout
 
 
@@ -64,7 +64,7 @@ class FakeChallengers:
         return [an_episode(16.0, 32.0, [False, False], self.errors)]
 
 
-class FixedReward(NoLearner):
+class FixedReward:
     """Has a snapshot, as the learners that selectors keep."""
 
     def snapshot(self):
@@ -75,9 +75,8 @@ class FixedReward(NoLearner):
 
 
 def training(selector=None, challengers=None):
-    return Training(
-        Counting(), None, NoLearner(2), selector or LastRound(), ["one", "other"], challengers
-    )
+    settings = ["one", "other"]
+    return Training(Counting(), None, settings, selector=selector, challengers=challengers)
 
 
 def test_a_row_holds_the_episodes_of_its_setting():
@@ -107,7 +106,7 @@ def test_a_resumed_run_remembers_the_best_round():
 
     def selected():
         return training(
-            BestRound(lambda policy: -abs(policy.weight.item() - 2.0), FixedReward(2), 1, 5)
+            BestRound(lambda policy: -abs(policy.weight.item() - 2.0), FixedReward(), 1, 5)
         )
 
     saved = []

@@ -18,7 +18,7 @@ from irlcli.errors import StageFailed
 from irlcli.interventions import parse_setting, parse_settings
 from irlcli.learners.actions import ActionView
 from irlcli.learners.cloning import clone
-from irlcli.rl.loop import LastRound, NoLearner, Training
+from irlcli.rl.loop import Training
 from irlcli.rl.policy import describe, load_policy
 from irlcli.rl.ppo import PPOTrainer, TrueReward
 from irlcli.rl.rollout import roll_out
@@ -253,7 +253,7 @@ def test_an_exploded_world_is_named_and_training_continues():
     worlds = VectorWorlds([Exploding(False), Exploding(True)], 16)
     trainer = make_trainer(worlds)
     settings = ["mass=1x", "mass=10x"]
-    training = Training(trainer, TrueReward(), NoLearner(2), LastRound(), settings)
+    training = Training(trainer, TrueReward(), settings)
     rows = training.run(lambda *_: None, warnings.append)
     assert len(rows) == 2 * trainer.rounds
     calm, wild = rows[:2]
