@@ -96,7 +96,7 @@ class LearnedReward:
 
     def module(self) -> StandaloneReward:
         """The same function of tensors, as a :class:`torch.nn.Module`."""
-        return self._frozen.standalone()
+        return self._frozen.module
 
     def about(self) -> dict[str, Any]:
         """Where the reward comes from and what it takes, for a file that leaves the store."""

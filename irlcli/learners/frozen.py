@@ -12,7 +12,7 @@ from irlcli.data.descriptions import Reward
 from irlcli.errors import UsageError
 from irlcli.learners.actions import ActionView, Policy
 from irlcli.learners.reward_model import RewardModule
-from irlcli.learners.scoring import episode_reward, level_of, transformed_reward
+from irlcli.learners.scoring import episode_reward, level_of
 from irlcli.learners.standalone import StandaloneReward
 from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
 
@@ -65,9 +65,12 @@ class FrozenReward:
         self._model = model
         self._scale = origin.scale
         self._horizon = horizon
-        self._gamma = gamma
         self._absorbing = origin.airl.fixed_horizon
         self._view = ActionView(origin.airl.actions, actions)
+        #: :meth:`of_steps` of tensors.
+        self.module = StandaloneReward(
+            model, self._scale, self._absorbing, gamma, self._ceiling, *self._view.bounds()
+        )
 
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The reward [T, N] of every step; what ``policy`` does elsewhere does not matter."""
@@ -76,26 +79,10 @@ class FrozenReward:
 
     def of_steps(self, data: Transitions) -> np.ndarray:
         """The reward [B] float32 of each step of ``data``, as :meth:`rewards` gives it."""
-        seen = self._view.of(data)
-        reward = transformed_reward(
-            self._model,
-            seen,
-            lambda g: g.clamp(max=self._ceiling),
-            self._absorbing,
-            self._gamma,
-        )
-        return (reward / self._scale).numpy()
-
-    def standalone(self) -> StandaloneReward:
-        """:meth:`of_steps` as a torch module of its own."""
-        return StandaloneReward(
-            self._model,
-            self._scale,
-            self._absorbing,
-            self._gamma,
-            self._ceiling,
-            *self._view.bounds(),
-        )
+        parts = data.observations, data.actions, data.next_observations, data.terminated
+        ends = bool(data.terminated.any())
+        with torch.no_grad():
+            return self.module(*map(torch.as_tensor, parts), ends).numpy()
 
     def of_transitions(
         self, observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray

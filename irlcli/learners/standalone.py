@@ -12,9 +12,6 @@ from irlcli.learners.scoring import absorbing_value
 class StandaloneReward(nn.Module):
     """min(g, ceiling) / scale, with the value of an absorbing state where one was learned.
 
-    It equals :meth:`irlcli.learners.frozen.FrozenReward.of_steps`, without that method's branch on the
-    data: an exported module has none.
-
     Args:
         model: the reward model.
         scale: standard deviation of g on training data.
@@ -50,6 +47,7 @@ class StandaloneReward(nn.Module):
         actions: torch.Tensor,
         next_observations: torch.Tensor,
         terminated: torch.Tensor,
+        ends: bool = True,
     ) -> torch.Tensor:
         """The reward [B] float32 of B steps.
 
@@ -57,12 +55,14 @@ class StandaloneReward(nn.Module):
             observations, next_observations: [B, D] float32.
             actions: [B, A] float32, or [B] or [B, K] int64 indices.
             terminated: [B] bool; a time limit is no termination.
+            ends: False if no step terminated, which saves computing g of absorbing states. An
+                exported module has no such argument and no branch on the data.
         """
         if self.low is not None and self.high is not None:
             actions = actions.clamp(self.low, self.high)
         vectors = self.model.encode(actions)
         reward = self.model.reward(observations, vectors).clamp(max=self._ceiling)
-        if self._absorbing:
+        if self._absorbing and ends:
             final = absorbed(self.model, next_observations).clamp(max=self._ceiling)
             reward = reward + absorbing_value(final, terminated.float(), self._gamma)
         return reward / self._scale

@@ -21,7 +21,8 @@ from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
 from irlcli.learners.pools import make_pool
 from irlcli.learners.reward_model import RewardModel, build
-from irlcli.learners.scoring import reward_quantiles, transformed_reward
+from irlcli.learners.scoring import reward_quantiles
+from irlcli.learners.standalone import StandaloneReward
 from irlcli.rl.rollout import roll_out
 from irlcli.trajectories import ActionSpace, Trajectory, Transitions, transitions
 
@@ -226,15 +227,9 @@ def bounded(network, ceiling, absorbing, terminated):
         {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
         | {"normaliser.variance": torch.ones(1), "g.0.weight": torch.tensor([[2.0, 3.0]])}
     )
-    data = Transitions(
-        observations=np.array([[1.0], [4.0]], np.float32),
-        actions=np.array([[1.0], [-1.0]], np.float32),
-        next_observations=np.array([[2.0], [8.0]], np.float32),
-        terminated=np.array([False, terminated]),
-        remaining=np.array([0, 5 * terminated]),
-    )
-    bounded = transformed_reward(model, data, lambda g: g.clamp(max=ceiling), absorbing, 0.9)
-    return bounded.tolist()
+    reward = StandaloneReward(model, 1.0, absorbing, 0.9, ceiling, None, None)
+    steps = [torch.tensor(values) for values in ([[1.0], [4.0]], [[1.0], [-1.0]], [[2.0], [8.0]])]
+    return reward(*steps, torch.tensor([False, terminated])).tolist()
 
 
 @pytest.mark.parametrize(
