@@ -62,13 +62,10 @@ def discriminator_loss(
     logits: torch.Tensor,
     f: torch.Tensor,
     weights: torch.Tensor,
-    merge_risks: bool,
-    penalty: str,
-    options: PenaltyOptions,
+    config: AIRLConfig,
+    penalty_weight: float,
     challenger_logits: torch.Tensor | None = None,
-    challenger_share: float = 0.0,
     input_gradient: Callable[[], torch.Tensor] | None = None,
-    input_gradient_weight: float = 0.0,
     parameters: Sequence[torch.Tensor] = (),
 ) -> Loss:
     """((1 - s) BCE + s BCE_challenger + c GP + lambda penalty) / max(1, lambda).
@@ -83,37 +80,37 @@ def discriminator_loss(
         logits: of the student's and the experts' samples [E, 2, B].
         f: the learned part [E, 2, B].
         weights: w [E], in sum one.
-        merge_risks: whether the penalty sees all E as one risk (``balanced``).
-        penalty: a key of ``irlcli.penalties.PENALTIES``.
-        options: how the penalty is estimated, and lambda.
+        config: s (``challenger.share``), c (``gradient_penalty``), the penalty and its estimate.
+            With the grouping ``balanced`` the penalty sees all E as one risk.
+        penalty_weight: lambda of this round.
         challenger_logits: of a challenger's and the experts' samples [E, 2, B]; None: there is none.
-        challenger_share: s.
         input_gradient: GP, the mean squared gradient of g by its input, computed when called.
-        input_gradient_weight: c.
         parameters: of the discriminator, see :class:`irlcli.penalties.Samples`.
     """
     student_share, others = 1.0, torch.zeros(())
     if challenger_logits is not None:
-        student_share = 1.0 - challenger_share
+        student_share = 1.0 - config.challenger.share
         challenged = (weights * cross_entropy(challenger_logits)).sum()
-        others = others + challenger_share * challenged
-    if input_gradient is not None and input_gradient_weight > 0.0:
-        others = others + input_gradient_weight * input_gradient()
+        others = others + config.challenger.share * challenged
+    if input_gradient is not None and config.gradient_penalty > 0.0:
+        others = others + config.gradient_penalty * input_gradient()
     risks = cross_entropy(logits)
     risk = (weights * risks).sum()
     seen = Samples(logits, f, risks, student_share * weights, tuple(parameters), input_gradient)
-    if merge_risks:
+    if config.grouping == "balanced":
         seen = seen._replace(
             logits=_merged(logits),
             f=_merged(f),
             risks=risk[None],
             weights=student_share * weights.sum(0, keepdim=True),
         )
-    penalised = discriminator_penalty(penalty)(seen, options)
+    unbiased = config.penalty_estimate == "unbiased"
+    options = PenaltyOptions(config.penalty_scaling, unbiased, penalty_weight)
+    penalised = discriminator_penalty(config.penalty)(seen, options)
     total = student_share * risk + others
-    if options.weight > 0.0:
-        total = total + options.weight * penalised
-        total = total / loss_divisor(penalty, options.weight)
+    if penalty_weight > 0.0:
+        total = total + penalty_weight * penalised
+        total = total / loss_divisor(config.penalty, penalty_weight)
     return Loss(total, risk.detach(), penalised.detach())
 
 
@@ -147,19 +144,15 @@ def minibatch_loss(
             found.append(gradient_penalty(model, part, mix))
         return torch.stack(found).mean()
 
-    unbiased = config.penalty_estimate == "unbiased"
     return discriminator_loss(
         logits,
         f,
         weights,
-        merge_risks=config.grouping == "balanced",
-        penalty=config.penalty,
-        options=PenaltyOptions(config.penalty_scaling, unbiased, penalty_weight),
-        challenger_logits=challenger_logits,
-        challenger_share=config.challenger.share,
-        input_gradient=input_gradient,
-        input_gradient_weight=config.gradient_penalty,
-        parameters=tuple(model.parameters()),
+        config,
+        penalty_weight,
+        challenger_logits,
+        input_gradient,
+        tuple(model.parameters()),
     )
 
 

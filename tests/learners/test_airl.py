@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import scipy.stats
@@ -16,7 +17,6 @@ from irlcli.learners.actions import clipped_log_prob
 from irlcli.learners.pools import Pool, Stratum, join_pools, make_pool, sample_minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.networks import ObservationNormaliser
-from irlcli.penalties import PenaltyOptions
 from irlcli.penalties.risk import cross_entropy
 from irlcli.trajectories import ActionSpace, Trajectory, Transitions, join
 
@@ -215,8 +215,13 @@ def test_total_loss_is_the_papers_divided_by_lambda(weight):
     torch.manual_seed(0)
     logit, f = torch.randn(2, 2, 6), torch.randn(2, 2, 6)
     weights = torch.tensor([0.25, 0.75])
-    options = PenaltyOptions("reward", unbiased=False, weight=weight)
-    loss = discriminator.discriminator_loss(logit, f, weights, False, "irmv1", options)
+    config = AIRLConfig(
+        grouping="per-setting",
+        penalty="irmv1",
+        penalty_scaling="reward",
+        penalty_estimate="square",
+    )
+    loss = discriminator.discriminator_loss(logit, f, weights, config, weight)
     risks = cross_entropy(logit)
     assert loss.cross_entropy.item() == pytest.approx((0.25 * risks[0] + 0.75 * risks[1]).item())
     expected = loss.cross_entropy + weight * loss.penalty
@@ -225,11 +230,13 @@ def test_total_loss_is_the_papers_divided_by_lambda(weight):
 
 def test_a_penalty_sees_balanced_settings_as_one_risk():
     torch.manual_seed(0)
-    logit, options = torch.randn(3, 2, 6), PenaltyOptions(unbiased=False)
+    logit = torch.randn(3, 2, 6)
+    config = AIRLConfig(grouping="balanced", penalty="irmv1", penalty_estimate="square")
+    separate = msgspec.structs.replace(config, grouping="per-setting")
     weights = torch.full((3,), 1 / 3)
     merged = torch.stack([logit[:, label].flatten() for label in (0, 1)])[None]
-    balanced = discriminator.discriminator_loss(logit, logit, weights, True, "irmv1", options)
-    one = discriminator.discriminator_loss(merged, merged, torch.ones(1), False, "irmv1", options)
+    balanced = discriminator.discriminator_loss(logit, logit, weights, config, 1.0)
+    one = discriminator.discriminator_loss(merged, merged, torch.ones(1), separate, 1.0)
     torch.testing.assert_close(balanced.penalty, one.penalty)
     torch.testing.assert_close(balanced.total, one.total)
 
@@ -282,9 +289,7 @@ def test_trained_discriminator_is_the_density_ratio():
     for _ in range(600):
         batch = sample_minibatch([[Stratum(policy, expert, None, 256)]], generator)
         logits, f = discriminator.discriminator_logits(model, batch)
-        loss = discriminator.discriminator_loss(
-            logits, f, torch.ones(1), False, "none", PenaltyOptions(weight=0.0)
-        )
+        loss = discriminator.discriminator_loss(logits, f, torch.ones(1), AIRLConfig(), 0.0)
         optimizer.zero_grad()
         loss.total.backward()
         optimizer.step()

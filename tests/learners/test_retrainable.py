@@ -26,7 +26,6 @@ from irlcli.learners import airl, discriminator
 from irlcli.learners.pools import Minibatch
 from irlcli.learners.replay import whole_episodes
 from irlcli.learners.reward_model import RewardModel
-from irlcli.penalties import PenaltyOptions
 from irlcli.penalties.risk import cross_entropy
 from irlcli.rl import worlds as worlds_module
 from irlcli.rl.challengers import Challengers
@@ -107,16 +106,20 @@ def test_without_shaping_f_is_g():
 def test_what_else_is_minimised_is_not_part_of_the_penalty(weight):
     torch.manual_seed(0)
     logit, weights = torch.randn(2, 2, 6), torch.tensor([0.25, 0.75])
-    options = PenaltyOptions("logit", unbiased=False, weight=weight)
-    arguments = (logit, logit, weights, False, "irmv1", options)
+    config = AIRLConfig(
+        grouping="per-setting",
+        penalty="irmv1",
+        penalty_estimate="square",
+        gradient_penalty=2.0,
+        challenger=ChallengerConfig(share=0.7),
+    )
+    arguments = (logit, logit, weights, config, weight)
     alone = discriminator.discriminator_loss(*arguments)
     challenger = torch.randn(2, 2, 6)
     both = discriminator.discriminator_loss(
         *arguments,
         challenger_logits=challenger,
-        challenger_share=0.7,
         input_gradient=lambda: torch.tensor(7.0),
-        input_gradient_weight=2.0,
     )
     assert both.penalty == alone.penalty and both.cross_entropy == alone.cross_entropy
     theirs = discriminator.discriminator_loss(challenger, challenger, *arguments[2:]).cross_entropy
@@ -150,10 +153,11 @@ def test_balanced_settings_share_the_risk_that_is_penalised(demos, grouping, mer
         learner.model, batch, None, weights, learner.config, 1.0, torch.Generator()
     )
     logits, f = discriminator.discriminator_logits(learner.model, batch, "f")
-    options = PenaltyOptions(learner.config.penalty_scaling, True, 1.0)
+    joined = [torch.stack([x[:, label].flatten() for label in (0, 1)])[None] for x in (logits, f)]
+    separate = AIRLConfig(grouping="per-setting", penalty="irmv1")
     one, other = (
-        discriminator.discriminator_loss(logits, f, weights, m, "irmv1", options).penalty.item()
-        for m in (merged, not merged)
+        discriminator.discriminator_loss(*samples, separate, 1.0).penalty.item()
+        for samples in ((*joined, torch.ones(1)), (logits, f, weights))[:: 1 if merged else -1]
     )
     assert found.penalty.item() == pytest.approx(one) != pytest.approx(other)
 
