@@ -17,9 +17,12 @@ import gymnasium
 import numpy as np
 import torch
 
+from irlcli import learners
 from irlcli.configs import AIRLConfig, load_config
+from irlcli.configs.relevance import relevant_airl
 from irlcli.envs.registry import environment
-from irlcli.interventions import parse_settings
+from irlcli.envs.symmetry import symmetries
+from irlcli.interventions import Setting, parse_settings
 from irlcli.learners.airl import AIRL
 from irlcli.rl.challengers import Challengers
 from irlcli.rl.ppo import PPOTrainer
@@ -42,14 +45,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--intervention", help="KNOB=VALUE,... in place of the usual one")
     arguments = parser.parse_args()
-    config = load_config(arguments.env, arguments.profile).airl
     settings = parse_settings(arguments.env, arguments.intervention or INTERVENTIONS[arguments.env])
+    config = load_config(arguments.env, arguments.profile).airl_of(settings)
 
     bare = make_worlds(arguments.env, settings, config.ppo.n_envs)
     # Random demonstrations cost as much to learn from as an expert's.
     demos = [roll_out(arguments.env, s, "random", 10, 0, "bench") for s in settings]
     worlds = make_worlds(arguments.env, settings, config.ppo.n_envs)
-    trainer, learner, challengers = build(arguments.env, worlds, demos, config)
+    trainer, learner, challengers = build(arguments.env, settings, worlds, demos, config)
 
     seconds: dict[str, float] = defaultdict(float)
     for owner, name, part in (
@@ -105,25 +108,39 @@ def main() -> None:
 
 def build(
     env: str,
+    settings: Sequence[Setting],
     worlds: Worlds,
     demos: Sequence[Sequence[Trajectory]],
     config: AIRLConfig,
 ) -> tuple[PPOTrainer, AIRL, Challengers | None]:
-    """Student, discriminator and challengers (if ``config`` has any) of a training in ``worlds``."""
-    trainer = PPOTrainer(worlds, config.ppo, config.total_steps, 0, "bench")
-    learner = AIRL(
+    """Student, learner and challengers (if ``config`` has any), as ``irl train-airl`` makes them."""
+    spec = environment(env)
+    config = relevant_airl(config, spec.discrete_actions)
+    size, actions = observation_size(worlds.observation_space), action_space(worlds.action_space)
+    trainer = PPOTrainer(
+        worlds, config.ppo, config.total_steps, 0, "bench", keep_moments=config.bc_epochs > 0
+    )
+    images = None
+    if config.symmetries is True:
+        images = symmetries(env, settings, size, actions.size)
+    learner = learners.learner(config.learner)(
         demos,
         config,
         worlds=len(worlds),
         rounds=trainer.rounds,
-        horizon=environment(env).max_episode_steps,
-        observation_size=observation_size(worlds.observation_space),
-        actions=action_space(worlds.action_space),
+        horizon=spec.max_episode_steps,
+        observation_size=size,
+        actions=actions,
         seed=0,
+        symmetries=images,
     )
     if config.challenger.life == 0:
         return trainer, learner, None
-    return trainer, learner, Challengers([worlds], config.challenger, learner, 0, "bench")
+    theirs = [worlds]
+    if config.challenger.per_setting is True and len(settings) > 1:
+        share = config.ppo.n_envs // len(settings)
+        theirs = [make_worlds(env, [setting], share) for setting in settings]
+    return trainer, learner, Challengers(theirs, config.challenger, learner, 0, "bench")
 
 
 def _timed(function: Callable, seconds: dict[str, float], part: str) -> Callable:

@@ -73,14 +73,14 @@ def main() -> None:
 
 def measure(rounds: int, settings: int, worlds: int, demonstrations: int) -> dict[str, float]:
     """CPU seconds of a training of ``rounds`` rounds, and this process's peak memory [MiB]."""
-    config = load_config(ENV, "standard").airl
-    config = replace(config, ppo=replace(config.ppo, n_envs=worlds))
-    config = replace(config, total_steps=config.ppo.steps_per_round * rounds)
     powers = ",".join(f"{1 + number / 50:g}x" for number in range(settings))
     parsed = parse_settings(ENV, f"engine-power={powers}")
+    config = load_config(ENV, "standard").airl_of(parsed)
+    config = replace(config, ppo=replace(config.ppo, n_envs=worlds))
+    config = replace(config, total_steps=config.ppo.steps_per_round * rounds)
     demos = [roll_out(ENV, s, "random", demonstrations, 0, "bench") for s in parsed]
     where = make_worlds(ENV, parsed, worlds)
-    trainer, learner, challengers = build(ENV, where, demos, config)
+    trainer, learner, challengers = build(ENV, parsed, where, demos, config)
     texts = [str(setting) for setting in parsed]
     training = Training(trainer, learner, texts, learner, challengers=challengers)
     started = time.process_time()

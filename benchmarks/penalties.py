@@ -12,16 +12,12 @@ from statistics import median
 
 import torch
 
-from benchmarks.airl import INTERVENTIONS
+from benchmarks.airl import INTERVENTIONS, build
 from irlcli.configs import load_config
-from irlcli.configs.relevance import relevant_airl
-from irlcli.envs.registry import environment
 from irlcli.interventions import parse_settings
-from irlcli.learners import learner
 from irlcli.methods import METHODS, fields
-from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
-from irlcli.rl.worlds import action_space, make_worlds, observation_size
+from irlcli.rl.worlds import make_worlds
 
 
 def main() -> None:
@@ -31,29 +27,21 @@ def main() -> None:
     parser.add_argument("--intervention", help="KNOB=VALUE,... in place of the usual one")
     parser.add_argument("--rounds", type=int, default=8)
     arguments = parser.parse_args()
-    env, spec = arguments.env, environment(arguments.env)
+    env = arguments.env
     settings = parse_settings(env, arguments.intervention or INTERVENTIONS[env])
-    base = load_config(env).airl
+    base = load_config(env).airl_of(settings)
     worlds = make_worlds(env, settings, base.ppo.n_envs)
     demos = [roll_out(env, s, "random", 10, 0, "bench") for s in settings]
-    trainer = PPOTrainer(worlds, base.ppo, base.total_steps, 0, "bench")
 
-    learners = {}
+    built = {}
     for name, method in METHODS.items():
         if method.learns_reward:
             flags = fields(name, "airl") | {"airl.challenger.life": 0}
             flags |= {"airl.penalty_warmup_rounds": 0, "airl.penalty_ramp_rounds": 1}
-            config = relevant_airl(load_config(env, flags=flags).airl, spec.discrete_actions)
-            learners[name] = learner(config.learner)(
-                demos,
-                config,
-                worlds=len(worlds),
-                rounds=trainer.rounds,
-                horizon=spec.max_episode_steps,
-                observation_size=observation_size(worlds.observation_space),
-                actions=action_space(worlds.action_space),
-                seed=0,
-            )
+            config = load_config(env, flags=flags).airl_of(settings)
+            built[name] = build(env, settings, worlds, demos, config)[:2]
+    learners = {name: learner for name, (_, learner) in built.items()}
+    trainer, _ = built["erm"]
     rollouts = trainer.train_round(0, learners["erm"])
     seconds: dict[str, list[float]] = {name: [] for name in learners}
     for index in range(arguments.rounds + 1):
