@@ -35,9 +35,6 @@ class TabularMDP:
         start: [S] float64, distribution of the first state.
         reward: [S] float64, the true reward of acting in a state.
         goal: the goal's state index.
-
-    Raises:
-        ValueError: shapes that do not fit, indices out of range, or rows that do not sum to one.
     """
 
     afterstate: np.ndarray
@@ -46,27 +43,6 @@ class TabularMDP:
     start: np.ndarray
     reward: np.ndarray
     goal: int
-
-    def __post_init__(self) -> None:
-        if self.afterstate.ndim != 2 or self.start.shape != (self.n_states,):
-            raise ValueError("afterstate must be [A, S] and start [S]")
-        if self.reward.shape != (self.n_states,) or not np.isfinite(self.reward).all():
-            raise ValueError(f"reward must be {self.n_states} finite numbers")
-        if self.successor.shape != self.probability.shape or self.successor.ndim != 2:
-            raise ValueError("successor and probability must both be [X, K]")
-        for name, index, limit in (
-            ("afterstate", self.afterstate, len(self.successor)),
-            ("successor", self.successor, self.n_states),
-            ("goal", np.array([self.goal]), self.n_states),
-        ):
-            if index.size == 0 or index.min() < 0 or index.max() >= limit:
-                raise ValueError(f"{name} must hold indices below {limit}")
-        total = self.probability.sum(1)
-        ended = (self.probability == 0.0).all(1)
-        if not (self.probability >= 0.0).all() or not np.allclose(total[~ended], 1.0, atol=1e-12):
-            raise ValueError("a row of probability must sum to one, or be all zero")
-        if not (self.start >= 0.0).all() or not np.isclose(self.start.sum(), 1.0):
-            raise ValueError("start must be a distribution")
 
     @property
     def n_states(self) -> int:
@@ -143,16 +119,7 @@ class StackedMDPs:
 
 
 def stack(mdps: Sequence[TabularMDP]) -> StackedMDPs:
-    """Stack ``mdps`` into one.
-
-    Raises:
-        ValueError: no MDP, or MDPs of different shapes.
-    """
-    if not mdps:
-        raise ValueError("at least one MDP is needed")
-    shapes = {(m.afterstate.shape, m.successor.shape) for m in mdps}
-    if len(shapes) > 1:
-        raise ValueError(f"MDPs of different shapes cannot be solved together: {sorted(shapes)}")
+    """Stack ``mdps``, at least one and all of one shape, into one."""
     (a, n), (x, k) = mdps[0].afterstate.shape, mdps[0].successor.shape
     afterstate = np.concatenate([m.afterstate + e * x for e, m in enumerate(mdps)], axis=1)
     successor = np.concatenate([m.successor + e * n for e, m in enumerate(mdps)])

@@ -38,14 +38,9 @@ class Rightness:
     Args:
         strength: probability that the cue is right, in [0, 1].
         seed: of the episode; None for unpredictable draws.
-
-    Raises:
-        ValueError: the strength is no probability.
     """
 
     def __init__(self, strength: float, seed: int | None = None):
-        if not 0.0 <= strength <= 1.0:
-            raise ValueError(f"cue_strength must lie in [0, 1], not {strength}")
         self._probabilities = np.array([TEXTURE, strength])
         self._random = np.random.default_rng(None if seed is None else [_STREAM, seed])
 
@@ -72,9 +67,6 @@ class CueWorld(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         env: the environment, with a vector as its observation.
         cue: what the quality is.
         strength: of the cue, in [0, 1].
-
-    Raises:
-        ValueError: the strength is no probability.
     """
 
     def __init__(self, env: gymnasium.Env, cue: Cue, strength: float):

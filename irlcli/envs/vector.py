@@ -41,16 +41,11 @@ class VectorWorlds:
     """N environments that take one array of actions and return one array of observations.
 
     Args:
-        envs: environments with equal observation and action spaces.
+        envs: at least one; all have equal observation and action spaces.
         max_episode_steps: time limit after which an episode is truncated.
-
-    Raises:
-        ValueError: ``envs`` is empty.
     """
 
     def __init__(self, envs: Sequence[gymnasium.Env], max_episode_steps: int):
-        if not envs:
-            raise ValueError("at least one environment is needed")
         self.envs = list(envs)
         self.max_episode_steps = max_episode_steps
         self.observation_space = envs[0].observation_space

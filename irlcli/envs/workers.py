@@ -154,13 +154,10 @@ class WorkerWorlds:
     """N environments distributed over worker processes, with the interface of ``VectorWorlds``.
 
     Args:
-        factories: one picklable function per environment that makes it. All environments have
+        factories: one picklable function for each of N >= 1 environments that makes it. All environments have
             equal observation and action spaces.
         max_episode_steps: time limit after which an episode is truncated.
-        workers: number of processes, at most one per environment.
-
-    Raises:
-        ValueError: ``factories`` is empty, or ``workers`` is not in [1, N].
+        workers: number of processes, in [1, N].
     """
 
     def __init__(
@@ -169,10 +166,6 @@ class WorkerWorlds:
         max_episode_steps: int,
         workers: int = 2,
     ):
-        if not factories:
-            raise ValueError("at least one environment is needed")
-        if not 1 <= workers <= len(factories):
-            raise ValueError(f"workers must lie in [1, {len(factories)}], not {workers}")
         sample = factories[0]()
         self.observation_space = sample.observation_space
         self.action_space = sample.action_space
@@ -222,11 +215,8 @@ class WorkerWorlds:
         """Start an episode in every environment, and return observations [N, D] float32.
 
         Raises:
-            ValueError: the number of seeds differs from the number of environments.
             WorkerFailed: a worker died, or an environment raised an error. All workers are ended.
         """
-        if len(seeds) != self._size:
-            raise ValueError(f"{self._size} seeds are needed, not {len(seeds)}")
         workers = len(self._channels)
         shares = [[int(seed) for seed in seeds[worker::workers]] for worker in range(workers)]
         self._ask(shares)
@@ -239,14 +229,8 @@ class WorkerWorlds:
         ended. Where an episode ended, the observation is the first one of the next episode.
 
         Raises:
-            ValueError: the actions have a wrong shape or are not finite.
             WorkerFailed: a worker died, or an environment raised an error. All workers are ended.
         """
-        actions = np.asarray(actions)
-        if actions.shape != self._actions.shape:
-            raise ValueError(f"actions must have shape {self._actions.shape}, not {actions.shape}")
-        if not np.isfinite(actions).all():
-            raise ValueError("actions must be finite")
         self._actions[:] = actions
         ended = self._ask([None] * len(self._channels))
         return self._observations.copy(), self._rewards.copy(), ended

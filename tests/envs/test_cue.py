@@ -53,12 +53,6 @@ def test_draws_do_not_depend_on_how_many_are_asked_for_at_once():
     assert np.array_equal(np.concatenate([one_by_one.draw() for _ in range(50)]), together.draw(50))
 
 
-@pytest.mark.parametrize("strength", [-0.1, 1.1, np.nan])
-def test_a_strength_that_is_no_probability_is_refused(strength):
-    with pytest.raises(ValueError, match=r"cue_strength must lie in \[0, 1\]"):
-        Rightness(strength)
-
-
 def test_the_quality_is_that_of_the_last_rewards():
     rewards = np.array([2.0, -1.0, 0.5, 0.25])
     last = Cue("default", window=1, bar=0.4)

@@ -76,8 +76,3 @@ def test_settings_have_equal_shares_in_order():
     worlds = make_worlds("lunar-lander", SETTINGS, 6)
     assert [env.engine_power for env in worlds.envs] == [1.0] * 3 + [1.5] * 3
     np.testing.assert_array_equal(world_settings(6, 2), [0, 0, 0, 1, 1, 1])
-
-
-def test_an_empty_list_of_environments_is_rejected():
-    with pytest.raises(ValueError, match="at least one"):
-        VectorWorlds([], 10)

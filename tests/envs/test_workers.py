@@ -268,32 +268,3 @@ def test_no_worker_outlives_its_parent(stop, tmp_path):
     assert "Process" not in parent.stderr.read()
     parent.stdout.close()
     parent.stderr.close()
-
-
-@pytest.mark.parametrize(
-    ("actions", "message"),
-    [
-        (np.zeros((3, 5)), r"shape \(3, 6\), not \(3, 5\)"),
-        (np.full((3, 6), np.nan), "finite"),
-    ],
-)
-def test_invalid_actions_are_rejected_and_the_workers_continue(actions, message):
-    worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
-    worlds.reset(SEEDS)
-    with pytest.raises(ValueError, match=message):
-        worlds.step(actions)
-    worlds.step(np.zeros((3, 6)))
-    worlds.close()
-
-
-@pytest.mark.parametrize("workers", [0, 4])
-def test_a_number_of_workers_out_of_range_is_rejected(workers):
-    with pytest.raises(ValueError, match=rf"\[1, 3\], not {workers}"):
-        WorkerWorlds(FACTORIES, max_episode_steps=5, workers=workers)
-
-
-def test_a_wrong_number_of_seeds_is_rejected():
-    worlds = WorkerWorlds(FACTORIES, max_episode_steps=5, workers=1)
-    with pytest.raises(ValueError, match="3 seeds are needed, not 2"):
-        worlds.reset([0, 1])
-    worlds.close()
