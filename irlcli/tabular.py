@@ -14,7 +14,7 @@ over R rewards. Internal arrays keep R last, so that a sparse row acts on all R 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,12 +145,11 @@ def stack(mdps: Sequence[TabularMDP]) -> StackedMDPs:
     )
 
 
-Backup = Callable[[np.ndarray], np.ndarray]
-"""Turns action values [A, E*S, ...] into the policy, in place; returns state values [E*S, ...]."""
+def _greedy(action_values: np.ndarray) -> np.ndarray:
+    """max_a Q [E*S, ...] of action values [A, E*S, ...], which become the policy in place.
 
-
-def hard_backup(action_values: np.ndarray) -> np.ndarray:
-    """max_a Q; the policy is greedy, uniform over ties. A :data:`Backup`."""
+    It is greedy, uniform over ties.
+    """
     best = action_values.max(0)
     slack = TIE_TOLERANCE * np.maximum(1.0, np.abs(best))
     np.greater_equal(action_values, best - slack, out=action_values)
@@ -159,9 +158,9 @@ def hard_backup(action_values: np.ndarray) -> np.ndarray:
 
 
 def backward(
-    settings: StackedMDPs, reward: np.ndarray, horizon: int, backup: Backup
+    settings: StackedMDPs, reward: np.ndarray, horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finite-horizon dynamic programming: V_H = r, Q_t = E[V_{t+1}], V_t = r + backup(Q_t).
+    """Value iteration over a finite horizon: V_H = r, Q_t = E[V_{t+1}], V_t = r + max_a Q_t.
 
     A trajectory is s_0, a_0, ..., s_H: H actions, and a reward for each of its H + 1 states.
 
@@ -170,7 +169,7 @@ def backward(
         horizon: H, at least 1 [steps].
 
     Returns:
-        The policy pi_t(a|s) [H, A, E, S, R] and V_0 [E, S, R].
+        The policy pi_t(a|s) [H, A, E, S, R], uniform over ties, and V_0 [E, S, R].
 
     Raises:
         ValueError: a reward of another shape or not finite; or as :func:`check_size`.
@@ -184,7 +183,7 @@ def backward(
         after = settings.spread @ value
         # All indices are in range; with "clip", take writes to ``out`` without a buffer.
         after.take(settings.afterstate, axis=0, out=policy[t], mode="clip")
-        value = backup(policy[t])
+        value = _greedy(policy[t])
         value += flat
     return policy.reshape(horizon, a, e, n, -1), value.reshape(e, n, -1)
 
@@ -252,7 +251,7 @@ def optimal_policy(
             raise ValueError(
                 f"setting {e}: the goal is {needed} steps away, the horizon only {horizon}"
             )
-    return backward(settings, reward, horizon, hard_backup)
+    return backward(settings, reward, horizon)
 
 
 def intended_path(mdp: TabularMDP, policy: np.ndarray) -> np.ndarray:

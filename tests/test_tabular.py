@@ -14,7 +14,6 @@ from irlcli.tabular import (
     dense_transitions,
     evaluate,
     forward,
-    hard_backup,
     intended_path,
     optimal_policy,
     shortest_path_length,
@@ -39,7 +38,7 @@ def random_mdp(seed: int, n: int = 7, a: int = 3, k: int = 4) -> TabularMDP:
 def test_hard_backward_and_forward_equal_a_dense_reference():
     mdps = [random_mdp(0), random_mdp(1)]
     reward = np.random.default_rng(2).normal(size=(3, 7))
-    policy, value = backward(stack(mdps), reward, 6, hard_backup)
+    policy, value = backward(stack(mdps), reward, 6)
     occupancy, last = forward(stack(mdps), policy)
     for e, mdp in enumerate(mdps):
         dense = dense_transitions(mdp)
@@ -62,10 +61,10 @@ def test_hard_backward_and_forward_equal_a_dense_reference():
 def test_a_reward_per_setting_and_runs_together_equal_each_alone():
     mdps = [random_mdp(0), random_mdp(1)]
     reward = np.random.default_rng(2).normal(size=(3, 2, 7))
-    policy, value = backward(stack(mdps), reward, 5, hard_backup)
+    policy, value = backward(stack(mdps), reward, 5)
     for e in range(2):
         for r in range(3):
-            alone, v = backward(stack([mdps[e]]), reward[r : r + 1, e], 5, hard_backup)
+            alone, v = backward(stack([mdps[e]]), reward[r : r + 1, e], 5)
             assert np.array_equal(policy[:, :, e, :, r], alone[:, :, 0, :, 0])
             assert np.allclose(value[e, :, r], v[0, :, 0], atol=1e-13)
 
@@ -94,7 +93,7 @@ def test_value_iteration_is_optimal_among_all_policies_of_a_tiny_mdp():
         policy = np.eye(2)[choice].transpose(0, 2, 1)[:, :, None, :, None]
         occupancy = forward(settings, policy)[0]
         best = max(best, float((occupancy[0, 0] * mdp.reward).sum()))
-    _, value = backward(settings, reward, 2, hard_backup)
+    _, value = backward(settings, reward, 2)
     assert float(mdp.start @ value[0, :, 0]) == pytest.approx(best, abs=1e-12)
 
 
@@ -108,7 +107,7 @@ def test_the_intended_path_ignores_slips_and_stays_at_the_goal():
 def test_a_grid_too_large_for_the_exact_solver_is_refused():
     settings = stack([gridworld(256)])
     with pytest.raises(ValueError, match="it would keep 100 GiB"):
-        backward(settings, np.zeros((100, 256**2)), 512, hard_backup)
+        backward(settings, np.zeros((100, 256**2)), 512)
 
 
 def test_an_unreachable_goal_is_refused():
@@ -124,8 +123,8 @@ def test_bad_arguments_of_the_solver_are_refused():
     settings = stack([random_mdp(0)])
     good = np.zeros((1, 7))
     with pytest.raises(ValueError, match="horizon must be"):
-        backward(settings, good, 0, hard_backup)
+        backward(settings, good, 0)
     with pytest.raises(ValueError, match="reward must be"):
-        backward(settings, np.zeros((1, 8)), 3, hard_backup)
+        backward(settings, np.zeros((1, 8)), 3)
     with pytest.raises(ValueError, match="not finite"):
-        backward(settings, np.full((1, 7), np.nan), 3, hard_backup)
+        backward(settings, np.full((1, 7), np.nan), 3)

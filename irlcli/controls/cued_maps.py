@@ -15,7 +15,7 @@ import numpy as np
 
 from irlcli.learners.occupancy import Demonstrations
 from irlcli.learners.soft_values import solve
-from irlcli.tabular import StackedMDPs, TabularMDP, backward, forward, hard_backup, stack
+from irlcli.tabular import StackedMDPs, TabularMDP, backward, forward, stack
 
 
 class Maps(NamedTuple):
@@ -151,7 +151,7 @@ def judge(
     seen = np.take_along_axis(each, maps.kinds, axis=2)
     own = solve(settings, seen, horizon).occupancy
     expert = solve(settings, value * maps.quality, horizon).occupancy
-    policy, _ = backward(settings, seen, horizon, hard_backup)
+    policy, _ = backward(settings, seen, horizon)
     best, _ = forward(settings, policy)
     quality, best_quality, expert_quality = (
         (occupancy * maps.quality).sum(-1).mean(-1) / (horizon + 1)
