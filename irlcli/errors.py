@@ -6,8 +6,8 @@ an exit status. Every other exception that reaches the command line is a bug.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 RETRY = "No partial output was written. Fix the problem and run the same command again."
 
@@ -84,18 +84,19 @@ class Interrupted(IrlError):
     exit_code = 130
 
 
-@contextmanager
-def importing(what: str, module: str) -> Iterator[None]:
-    """Report that ``module``, which ``what`` is registered with, cannot be imported in the body.
+def imported(what: str, place: str) -> Any:
+    """The object at ``place`` (``module`` or ``module:name``), which ``what`` is registered with.
 
     Raises:
         StageFailed: it or what it imports is not installed, or it has no such name.
     """
+    from pkgutil import resolve_name
+
     try:
-        yield
+        return resolve_name(place if ":" in place else f"{place}:")
     except (ModuleNotFoundError, AttributeError) as error:
         raise StageFailed(
-            f"{what}: {module} cannot be imported ({error})",
+            f"{what}: {place} cannot be imported ({error})",
             "install its package, or name its folder in PYTHONPATH; or correct the registered name",
         ) from error
 

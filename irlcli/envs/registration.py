@@ -21,7 +21,7 @@ from irlcli.envs.cue import CueWorld
 from irlcli.envs.own import check_code, module_of
 from irlcli.envs.registry import ENVIRONMENTS, environment
 from irlcli.envs.spec import Code, Cue, EnvironmentSpec, Own
-from irlcli.errors import IrlError, StageFailed, UsageError, described, first_line, importing
+from irlcli.errors import IrlError, StageFailed, UsageError, described, first_line, imported
 from irlcli.interventions import Setting, cue_in, env_kwargs, without_cue
 
 # What this process imported, as it was then: Python imports a module once.
@@ -86,8 +86,7 @@ def build(
         _require(spec)
         # Environments that were added since this module was imported.
         register()
-        with importing(f"environment {spec.name!r}", spec.entry_point):
-            resolve_name(spec.entry_point)
+        imported(f"environment {spec.name!r}", spec.entry_point)
         return gymnasium.make(spec.gym_id, **arguments).unwrapped
     world = Adapted(_own(spec, spec.own, arguments, f"{spec.name} {setting}"), spec.name)
     discrete = not isinstance(world.action_space, gymnasium.spaces.Box)

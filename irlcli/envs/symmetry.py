@@ -1,11 +1,10 @@
 """The symmetries that an environment declares."""
 
 from collections.abc import Sequence
-from pkgutil import resolve_name
 from typing import Any
 
 from irlcli.envs.registry import environment
-from irlcli.errors import StageFailed, UsageError, described, importing
+from irlcli.errors import StageFailed, UsageError, described, imported
 from irlcli.interventions import Setting, env_kwargs
 from irlcli.symmetries import Symmetries, check_group
 
@@ -27,8 +26,7 @@ def symmetries(
     place = environment(env).symmetries
     assert place is not None
     module, _, name = place.partition(":")
-    with importing(f"environment {env!r}", module):
-        function = getattr(resolve_name(module), name, None)
+    function = getattr(imported(f"environment {env!r}", module), name, None)
     if function is None:
         raise StageFailed(
             f"{module} has no function {name!r}",

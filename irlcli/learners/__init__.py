@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from irlcli.errors import importing
+from irlcli.errors import imported
 
 
 class Learner(NamedTuple):
@@ -33,8 +33,4 @@ def learner(name: str) -> Any:
     Raises:
         StageFailed: its module cannot be imported.
     """
-    from pkgutil import resolve_name
-
-    place = LEARNERS[name].place
-    with importing(f"learner {name!r}", place):
-        return resolve_name(place)
+    return imported(f"learner {name!r}", LEARNERS[name].place)

@@ -8,12 +8,11 @@ and its gradient by phi [R, K, S].
 """
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from irlcli.errors import UsageError, importing, suggest
+from irlcli.errors import UsageError, imported, suggest
 from irlcli.methods import METHODS
 
 if TYPE_CHECKING:
@@ -210,6 +209,4 @@ def occupancy_penalty(name: str) -> "Callable[[Occupancies], tuple[np.ndarray, n
 
 
 def _module(name: str) -> Any:
-    path = PENALTIES[name].module
-    with importing(f"penalty {name!r}", path):
-        return import_module(path)
+    return imported(f"penalty {name!r}", PENALTIES[name].module)

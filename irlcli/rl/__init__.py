@@ -5,7 +5,7 @@ Importing it loads neither torch nor stable-baselines3.
 
 from typing import Any
 
-from irlcli.errors import importing
+from irlcli.errors import imported
 
 # Name to module and class, one line each. A class takes (worlds, config, total_steps, seed, purpose)
 # and, for --start student, ``keep_moments``; it is a :class:`irlcli.rl.loop.Trainer`. All but SAC are
@@ -22,8 +22,4 @@ def algorithm(name: str) -> Any:
     Raises:
         StageFailed: its module cannot be imported.
     """
-    from pkgutil import resolve_name
-
-    place = ALGORITHMS[name]
-    with importing(f"algorithm {name!r}", place):
-        return resolve_name(place)
+    return imported(f"algorithm {name!r}", ALGORITHMS[name])
