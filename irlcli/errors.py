@@ -118,40 +118,6 @@ def described(error: BaseException) -> str:
     return f"{name}: {first_line(error)}" if str(error).strip() else name
 
 
-_KINDS = {
-    "int": "a whole number",
-    "float": "a number",
-    "str": "text",
-    "bool": "true or false",
-    "null": "none",
-    "array": "a list",
-    "object": "a table",
-}
-
-
-_BOUNDS = {">=": "of at least", ">": "above", "<=": "of at most", "<": "below"}
-
-
-def of_types(message: str) -> str:
-    """msgspec's message about a value's type or range, in the words of a settings file."""
-    import re
-
-    bound = re.match("Expected `(int|float)` (>=|>|<=|<) (.+)$", message)
-    if bound is not None:
-        kind, sign, number = bound.groups()
-        return f"expected {_KINDS[kind]} {_BOUNDS[sign]} {number.removesuffix('.0')}"
-    found = re.match("Expected `([^`]+)`, got `([^`]+)`$", message)
-    if found is None:
-        return message
-    expected, got = (
-        " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
-        for kinds in found.groups()
-    )
-    if found.groups() == ("int", "float"):
-        got = "one with a point or an exponent"
-    return f"expected {expected}, found {got}"
-
-
 def closest(name: str, known: Iterable[str]) -> str | None:
     """The known name that is most similar to ``name``, or ``None`` if none is similar."""
     # Imported here because only mistakes need it, and every command imports this module.

@@ -9,12 +9,22 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from irlcli.errors import UsageError, of_types, suggest
+from irlcli.errors import UsageError, suggest
 
 # A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
 _MAX_TOML_BYTES = 64 << 10
 _MAX_TOML_LINE = 2000
 Form = TypeVar("Form", bound=msgspec.Struct)
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "bool": "true or false",
+    "null": "none",
+    "array": "a list",
+    "object": "a table",
+}
+_BOUNDS = {">=": "of at least", ">": "above", "<=": "of at most", "<": "below"}
 
 
 def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
@@ -90,3 +100,21 @@ def with_key(value: Mapping[str, Any], form: type[Form], field: str) -> str:
         except msgspec.ValidationError:
             return f"{name}.{key}{rest}"
     return field
+
+
+def of_types(message: str) -> str:
+    """msgspec's message about a value's type or range, in the words of a settings file."""
+    bound = re.match("Expected `(int|float)` (>=|>|<=|<) (.+)$", message)
+    if bound is not None:
+        kind, sign, number = bound.groups()
+        return f"expected {_KINDS[kind]} {_BOUNDS[sign]} {number.removesuffix('.0')}"
+    found = re.match("Expected `([^`]+)`, got `([^`]+)`$", message)
+    if found is None:
+        return message
+    expected, got = (
+        " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
+        for kinds in found.groups()
+    )
+    if found.groups() == ("int", "float"):
+        got = "one with a point or an exponent"
+    return f"expected {expected}, found {got}"

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from irlcli.configs.documents import parse_toml, read_toml, with_key
+from irlcli.configs.documents import of_types, parse_toml, read_toml, with_key
 from irlcli.configs.relevance import check_registered
 from irlcli.configs.schema import (
     AIRLConfig,
@@ -22,7 +22,7 @@ from irlcli.configs.schema import (
     TransferConfig,
 )
 from irlcli.envs.registry import environment
-from irlcli.errors import UsageError, of_types, suggest
+from irlcli.errors import UsageError, suggest
 from irlcli.interventions import Setting, knob_of, listed_settings, overlap
 
 PROFILES = ("smoke", "standard", "paper")
