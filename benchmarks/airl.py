@@ -20,8 +20,8 @@ import torch
 from irlcli import learners
 from irlcli.configs import AIRLConfig, load_config
 from irlcli.configs.relevance import relevant_airl
+from irlcli.envs.declared_symmetries import symmetries
 from irlcli.envs.registry import environment
-from irlcli.envs.symmetry import symmetries
 from irlcli.interventions import Setting, parse_settings
 from irlcli.learners.airl import AIRL
 from irlcli.rl.challengers import Challengers

@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium.utils.env_checker import check_env
 
 from irlcli.envs.adapted import Adapted, prints_aside
+from irlcli.envs.declared_symmetries import symmetries
 from irlcli.envs.registration import make
 from irlcli.envs.spec import EnvironmentSpec, Knob
-from irlcli.envs.symmetry import symmetries
 from irlcli.errors import IrlError, first_line
 from irlcli.interventions import Setting, Value
 

@@ -327,7 +327,7 @@ def _learner(
 def _symmetries(
     p: Parameters, settings: Sequence[str], observation_size: int, action_size: int
 ) -> Symmetries | None:
-    from irlcli.envs.symmetry import symmetries
+    from irlcli.envs.declared_symmetries import symmetries
 
     if p.airl.symmetries is not True:
         return None

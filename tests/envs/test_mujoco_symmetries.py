@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from mujoco_robots import Ant
 
+from irlcli.envs.declared_symmetries import check_group
 from irlcli.envs.mujoco.symmetries import ant
-from irlcli.symmetries import Symmetries, check_group
+from irlcli.symmetries import Symmetries
 
 CHANGED = {"mass": 2.0, "friction": 0.5, "actuator_strength": 0.75, "joint_limit": 0.75}
 LONG_LEGS = {"leg_length": 2.0}

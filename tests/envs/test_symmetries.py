@@ -5,7 +5,8 @@ import pytest
 
 from irlcli.envs.ant.env import Ant
 from irlcli.envs.ant.symmetries import symmetries
-from irlcli.symmetries import Symmetries, check_group
+from irlcli.envs.declared_symmetries import check_group
+from irlcli.symmetries import Symmetries
 from tests.envs.bullet_robots import body, pybullet
 
 SQUARE = [{"friction": (2.0, 0.6, 0.6)}, {"mass": 2.0}, {}]
