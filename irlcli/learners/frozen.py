@@ -84,7 +84,7 @@ class FrozenReward:
         with torch.no_grad():
             return self.module(*map(torch.as_tensor, parts), ends).numpy()
 
-    def of_transitions(
+    def g_over_scale(
         self, observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray
     ) -> np.ndarray:
         """g / scale [B] of single steps, without ceiling. It does not depend on the successors."""

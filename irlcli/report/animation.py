@@ -164,7 +164,7 @@ def _panels(
         rewards.append(float(reward))
         if score is not None:
             step = observations[-2][None], np.asarray(action)[None], observations[-1][None]
-            learned += float(score.of_transitions(*step)[0])
+            learned += float(score.g_over_scale(*step)[0])
     if score is not None and terminated:
         learned = score.of_episode(
             Trajectory(

@@ -191,7 +191,7 @@ def _epic_distances(
         here = {entry.kind: group for entry, group in episodes.items() if entry.setting == place}
         good = here.get("expert", here.get("student", ()))
         data = transitions([*here["random"], *good], where.max_episode_steps)
-        learned = frozen_reward(where, place, model, origin).of_transitions
+        learned = frozen_reward(where, place, model, origin).g_over_scale
         found[place] = epic_distance(true, learned, data, origin.network.gamma)
     return found, ""
 

@@ -66,7 +66,7 @@ def run(job: Job) -> None:
     for index, text in enumerate(p.settings):
         frozen = frozen_reward(p.environment, text, model, origin)
         steps = transitions(demos.trajectories[text], p.environment.max_episode_steps)
-        contrasts = hint_contrasts(frozen.of_transitions, steps)
+        contrasts = hint_contrasts(frozen.g_over_scale, steps)
         found.append(HintContrast(setting=text, steps=len(steps), **contrasts))
         facts = {text: " ".join(f"{name} {value:.2f}" for name, value in contrasts.items())}
         job.console.progress(index + 1, len(p.settings), "settings", facts)

@@ -201,7 +201,7 @@ def test_actions_are_clipped_where_the_reward_saw_them_so(tmp_path, actions, sec
     expected = (2 * 1.0 + 3 * -1.0 + 2 * 2.0 + 3 * second) / 2.0
     assert reward.of_episode(episode) == pytest.approx(expected, rel=1e-5)
     steps = transitions([episode], 1000)
-    each = reward.of_transitions(steps.observations, steps.actions, steps.next_observations)
+    each = reward.g_over_scale(steps.observations, steps.actions, steps.next_observations)
     assert each.tolist() == pytest.approx([-0.5, (2 * 2.0 + 3 * second) / 2.0])
 
 
