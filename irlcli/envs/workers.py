@@ -6,16 +6,12 @@ messages. The environments are independent, so results do not depend on the numb
 
 Worker k of n gets environments k, k + n, k + 2n, and so on. Environments of one setting are
 neighbours and cost the same, so this balances the load.
-
-A message is one byte, optionally followed by a pickle. Most steps need the byte only: the request
-to step, and the answer that no episode ended.
 """
 
 from __future__ import annotations
 
 import atexit
 import multiprocessing
-import os
 import signal
 import traceback
 import weakref
@@ -23,7 +19,6 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import ForkingPickler
 from multiprocessing.sharedctypes import RawArray
 from typing import Any, NamedTuple
 
@@ -36,7 +31,6 @@ from irlcli.errors import IrlError, StageFailed, described
 _CLOSE_SECONDS = 5.0
 # Raised by a pipe whose other end is closed.
 _CLOSED = (EOFError, BrokenPipeError, ConnectionResetError)
-_PLAIN, _PICKLED = b"0", b"1"
 
 
 class WorkerFailed(StageFailed):
@@ -56,30 +50,6 @@ class _Failure(NamedTuple):
     message: str
     hint: str
     traceback: str
-
-
-class _Channel(NamedTuple):
-    """One end of a pair of pipes. The message ``None`` is sent without a pickle."""
-
-    incoming: Connection
-    outgoing: Connection
-
-    def send(self, message: Any) -> None:
-        # Before the first byte: what cannot be pickled must not leave half a message.
-        pickled = None if message is None else ForkingPickler.dumps(message)
-        os.write(self.outgoing.fileno(), _PLAIN if pickled is None else _PICKLED)
-        if pickled is not None:
-            self.outgoing.send_bytes(pickled)
-
-    def receive(self) -> Any:
-        byte = os.read(self.incoming.fileno(), 1)
-        if not byte:
-            raise EOFError
-        return self.incoming.recv() if byte == _PICKLED else None
-
-    def close(self) -> None:
-        self.incoming.close()
-        self.outgoing.close()
 
 
 @dataclass(frozen=True)
@@ -103,7 +73,7 @@ class _Shared:
 
 
 def _work(
-    channel: _Channel,
+    connection: Connection,
     factories: Sequence[Callable[[], gymnasium.Env]],
     max_episode_steps: int,
     worker: int,
@@ -124,15 +94,14 @@ def _work(
         made = VectorWorlds([factory() for factory in factories], max_episode_steps)
         with closing(made) as worlds:
             while True:
-                seeds = channel.receive()
+                seeds = connection.recv()
                 ended: list[Ended] = []
                 if seeds is None:
                     # A copy: an environment may keep its last action.
                     observations[:], rewards[:], ended = worlds.step(actions.copy())
                 else:
                     observations[:] = worlds.reset(seeds)
-                ended = [replace(end, world=worker + workers * end.world) for end in ended]
-                channel.send(ended or None)
+                connection.send([replace(end, world=worker + workers * end.world) for end in ended])
     except _CLOSED:
         pass
     except Exception as error:
@@ -141,7 +110,7 @@ def _work(
             message, hint = error.message, error.hint
         # If another worker failed in the same step, the parent has closed the pipe.
         with suppress(*_CLOSED):
-            channel.send(_Failure(message, hint, f"\n{traceback.format_exc()}"))
+            connection.send(_Failure(message, hint, f"\n{traceback.format_exc()}"))
 
 
 def _close(worlds: weakref.ref[WorkerWorlds]) -> None:
@@ -189,11 +158,10 @@ class WorkerWorlds:
         # A forked process would inherit its siblings' pipe ends and keep them open, which would
         # hide the death of a worker or of the parent.
         context = multiprocessing.get_context("spawn")
-        self._channels: list[_Channel] = []
+        self._connections: list[Connection] = []
         self._processes: list[multiprocessing.process.BaseProcess] = []
         for worker in range(workers):
-            (requests, ask), (answers, answer) = context.Pipe(False), context.Pipe(False)
-            theirs = _Channel(requests, answer)
+            ours, theirs = context.Pipe()
             share = factories[worker::workers]
             process = context.Process(
                 target=_work,
@@ -202,7 +170,7 @@ class WorkerWorlds:
             )
             process.start()
             theirs.close()
-            self._channels.append(_Channel(answers, ask))
+            self._connections.append(ours)
             self._processes.append(process)
         # At exit, multiprocessing sends SIGTERM to its children and waits for them. These ignore it,
         # so their pipes must be closed before. What is registered last runs first.
@@ -217,7 +185,7 @@ class WorkerWorlds:
         Raises:
             WorkerFailed: a worker died, or an environment raised an error. All workers are ended.
         """
-        workers = len(self._channels)
+        workers = len(self._connections)
         shares = [[int(seed) for seed in seeds[worker::workers]] for worker in range(workers)]
         self._ask(shares)
         return self._observations.copy()
@@ -232,36 +200,36 @@ class WorkerWorlds:
             WorkerFailed: a worker died, or an environment raised an error. All workers are ended.
         """
         self._actions[:] = actions
-        ended = self._ask([None] * len(self._channels))
+        ended = self._ask([None] * len(self._connections))
         return self._observations.copy(), self._rewards.copy(), ended
 
     def close(self) -> None:
         """End every worker; a second call does nothing."""
-        for channel in self._channels:
-            channel.close()
+        for connection in self._connections:
+            connection.close()
         for process in self._processes:
             process.join(_CLOSE_SECONDS)
             if process.is_alive():
                 process.kill()
                 process.join()
-        self._channels = []
+        self._connections = []
         self._processes = []
 
     def _ask(self, requests: Sequence[list[int] | None]) -> list[Ended]:
-        """Send one request to each worker, and return the ended episodes in order of world."""
-        if not self._channels:
+        """Send each worker its seeds, or None to step; return the ended episodes in order of world."""
+        if not self._connections:
             raise WorkerFailed("the workers are closed")
         ended: list[Ended] = []
         worker = 0
         try:
             for worker, request in enumerate(requests):
-                self._channels[worker].send(request)
-            for worker, channel in enumerate(self._channels):
-                answer = channel.receive()
+                self._connections[worker].send(request)
+            for worker, connection in enumerate(self._connections):
+                answer = connection.recv()
                 if isinstance(answer, _Failure):
                     message = f"{self._name(worker)}: {answer.message}"
                     raise WorkerFailed(message, answer.hint) from _InWorker(answer.traceback)
-                ended += answer or []
+                ended += answer
         except BaseException as error:
             # An unread answer would be mistaken for the answer to the next request.
             failure = self._died(worker) if isinstance(error, _CLOSED) else error
@@ -277,5 +245,5 @@ class WorkerWorlds:
         return WorkerFailed(f"{self._name(worker)} died: {cause}")
 
     def _name(self, worker: int) -> str:
-        worlds = list(range(worker, self._size, len(self._channels)))
+        worlds = list(range(worker, self._size, len(self._connections)))
         return f"worker {worker} ({'world' if len(worlds) == 1 else 'worlds'} {str(worlds)[1:-1]})"

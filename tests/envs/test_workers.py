@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -18,7 +17,7 @@ import pytest
 from mujoco_robots import HalfCheetah
 
 from irlcli.envs.vector import VectorWorlds
-from irlcli.envs.workers import WorkerFailed, WorkerWorlds, _Channel
+from irlcli.envs.workers import WorkerFailed, WorkerWorlds
 from irlcli.errors import StageFailed
 
 SEEDS = [3, 1, 4]
@@ -188,17 +187,6 @@ def test_workers_that_fail_together_print_nothing(capfd):
     with pytest.raises(WorkerFailed, match="worker 0"):
         worlds.step(np.zeros(2, dtype=np.int64))
     assert capfd.readouterr().err == ""
-
-
-def test_what_cannot_be_pickled_leaves_no_half_message():
-    incoming, outgoing = multiprocessing.Pipe(False)
-    channel = _Channel(incoming, outgoing)
-    with pytest.raises((AttributeError, pickle.PicklingError)):
-        channel.send(lambda: None)
-    assert not incoming.poll()
-    channel.send([3])
-    assert channel.receive() == [3]
-    channel.close()
 
 
 def test_a_dead_worker_is_reported_and_the_others_are_ended():
