@@ -1,4 +1,4 @@
-"""Ranges and shapes of the numbers that the robot environments take."""
+"""Checks of the arguments and actions of the built-in environments."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ from typing import Any
 
 import numpy as np
 
+from irlcli.envs.spec import Knob
 
-def require(name: str, value: Any, low: float, high: float) -> float:
-    """Return ``value`` as a float.
+
+def require(knob: Knob, value: Any) -> float:
+    """``value`` of the keyword argument of ``knob``, as a float.
 
     Raises:
-        ValueError: ``value`` is not a number in [low, high].
+        ValueError: ``value`` is not a number within the knob's bounds.
     """
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if not low <= number <= high:
-        raise ValueError(f"{name} must lie in [{low:g}, {high:g}], not {value!r}")
+    if not knob.low <= number <= knob.high:
+        raise ValueError(
+            f"{knob.argument} must lie in [{knob.low:g}, {knob.high:g}], not {value!r}"
+        )
     return number
 
 

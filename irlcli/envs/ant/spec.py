@@ -1,7 +1,7 @@
 """Ant: interventions and time limit (paper Table 2)."""
 
-from irlcli.envs.bullet.knobs import PYBULLET, WALKER_KNOBS
-from irlcli.envs.spec import EnvironmentSpec, Knob
+from irlcli.envs.bullet.knobs import LEG_LENGTH, PYBULLET, WALKER_KNOBS
+from irlcli.envs.spec import EnvironmentSpec
 
 SPEC = EnvironmentSpec(
     name="ant",
@@ -10,7 +10,7 @@ SPEC = EnvironmentSpec(
     max_episode_steps=1000,
     knobs={
         **WALKER_KNOBS,
-        "leg-length": Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the hind legs"),
+        "leg-length": LEG_LENGTH._replace(description="length of the hind legs"),
     },
     symmetries="irlcli.envs.ant.symmetries:symmetries",
     needs=PYBULLET,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from irlcli.envs.arguments import require
+from irlcli.envs.bullet.knobs import WALKER_KNOBS
 
 GOAL_DISTANCE = 1000.0
 
@@ -35,7 +36,7 @@ class Goal:
                 f"goal_y and direction exclude each other, not {goal_y!r} and {direction!r}"
             )
         self.observed = goal_y is not None or direction is not None
-        self._y = 0.0 if goal_y is None else require("goal_y", goal_y, -10000.0, 10000.0)
+        self._y = 0.0 if goal_y is None else require(WALKER_KNOBS["goal-y"], goal_y)
         self._range = None if direction is None else _angle_range(direction)
 
     def draw(self, random: np.random.Generator) -> tuple[float, float]:
@@ -61,7 +62,7 @@ def _angle_range(direction: Any) -> tuple[float, float]:
     ends = (direction, direction) if np.ndim(direction) == 0 else tuple(direction)
     if len(ends) != 2:
         raise ValueError(f"direction must be one angle or a pair, not {direction!r}")
-    low, high = (require("direction", end, -180.0, 180.0) for end in ends)
+    low, high = (require(WALKER_KNOBS["direction"], end) for end in ends)
     if low > high:
         raise ValueError(f"direction must be (smaller, larger), not {direction!r}")
     return low, high

@@ -1,4 +1,4 @@
-"""The interventions that Ant and HalfCheetah share (paper Table 2), and the library they need."""
+"""The knobs of Ant and HalfCheetah (paper Table 2) and their library, without importing PyBullet."""
 
 from irlcli.envs.spec import Knob, Needs
 
@@ -8,6 +8,8 @@ PYBULLET = Needs(
     "use Python 3.11, for which it has wheels, or a MuJoCo robot, such as --env mujoco-ant",
 )
 
+# Which legs, the robot decides.
+LEG_LENGTH = Knob("leg_length", ("multiplier",), 0.2, 5.0, "length of the legs")
 WALKER_KNOBS = {
     "mass": Knob("mass", ("multiplier",), 0.1, 10.0, "mass of every link"),
     "goal-y": Knob(

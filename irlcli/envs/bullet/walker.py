@@ -1,4 +1,4 @@
-"""The interventions that Ant and HalfCheetah share, and the robot that results from them."""
+"""Ant's and HalfCheetah's arguments, checked, and the robot that they make."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from irlcli.envs.bullet.arguments import require_friction, require_model
 from irlcli.envs.bullet.body import Link, Vector, create_body
 from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.goal import Goal
+from irlcli.envs.bullet.knobs import LEG_LENGTH, WALKER_KNOBS
 from irlcli.envs.bullet.mjcf import load_bodies, moving_joints
 from irlcli.envs.bullet.robot import Robot
 
@@ -39,9 +40,9 @@ class Walker:
         direction: float | Sequence[float] | None,
         model: str,
     ):
-        self.mass = require("mass", mass, 0.1, 10.0)
+        self.mass = require(WALKER_KNOBS["mass"], mass)
         self.friction = require_friction(friction)
-        self.leg_length = require("leg_length", leg_length, 0.2, 5.0)
+        self.leg_length = require(LEG_LENGTH, leg_length)
         self.model = require_model(model, self.leg_length)
         self.goal = Goal(goal_y, direction)
 

@@ -1,7 +1,7 @@
 """HalfCheetah: interventions and time limit (paper Table 2)."""
 
-from irlcli.envs.bullet.knobs import PYBULLET, WALKER_KNOBS
-from irlcli.envs.spec import Cue, EnvironmentSpec, Knob, cue_knob
+from irlcli.envs.bullet.knobs import LEG_LENGTH, PYBULLET, WALKER_KNOBS
+from irlcli.envs.spec import Cue, EnvironmentSpec, cue_knob
 
 SPEC = EnvironmentSpec(
     name="half-cheetah",
@@ -10,8 +10,8 @@ SPEC = EnvironmentSpec(
     max_episode_steps=1000,
     knobs={
         **WALKER_KNOBS,
-        "leg-length": Knob(
-            "leg_length", ("absolute", "multiplier"), 0.2, 5.0, "length of both legs"
+        "leg-length": LEG_LENGTH._replace(
+            forms=("absolute", "multiplier"), description="length of both legs"
         ),
         # On the way to the goal: the last step went forward, at half a metre per second or more.
         "cue-strength": cue_knob(Cue("friction=1.5:0.1:0.1", window=1, bar=0.5)),

@@ -15,6 +15,7 @@ from gymnasium.envs.box2d import lunar_lander as original
 from gymnasium.utils import EzPickle
 
 from irlcli.envs.arguments import require
+from irlcli.envs.lunar_lander.spec import SPEC
 
 
 def _bind(function: Callable[..., Any], **constants: float) -> types.FunctionType:
@@ -55,9 +56,9 @@ class LunarLander(original.LunarLander):
         engine_power: float = 1.0,
         render_mode: str | None = None,
     ):
-        self.bounce = require("bounce", bounce, 0.0, 1.0)
-        self.friction = require("friction", friction, 0.0, 10.0)
-        self.engine_power = require("engine_power", engine_power, 0.05, 20.0)
+        self.bounce = require(SPEC.knobs["bounce"], bounce)
+        self.friction = require(SPEC.knobs["friction"], friction)
+        self.engine_power = require(SPEC.knobs["engine-power"], engine_power)
         super().__init__(render_mode=render_mode)
         EzPickle.__init__(self, bounce, friction, engine_power, render_mode)
         self._original_step = _bind(

@@ -60,7 +60,7 @@ class Robot(MujocoEnv, EzPickle):
         options = {name: arguments[name] for name in arguments if name not in Changes._fields}
         self._changes = Changes(
             **{
-                name: require(name, value, _KNOBS[name].low, _KNOBS[name].high)
+                name: require(_KNOBS[name], value)
                 for name, value in arguments.items()
                 if name not in options
             }

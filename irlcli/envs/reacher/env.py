@@ -26,6 +26,8 @@ from irlcli.envs.bullet.episode import RobotEnv
 from irlcli.envs.bullet.mjcf import load_bodies
 from irlcli.envs.bullet.robot import Robot
 from irlcli.envs.bullet.world import GRAVITY, TIME_STEP, World
+from irlcli.envs.reacher.spec import SPEC
+from irlcli.envs.spec import Knob
 
 _RADIUS = single(0.01)
 _BALL_RADIUS = 0.01
@@ -33,6 +35,8 @@ _HEIGHT = single(0.01)
 _UPPER = single(0.1)
 _FINGERTIP = single(0.11)
 _ELBOW_LIMIT = 3.0
+# No setting changes it.
+_TILT = Knob("tilt", ("absolute",), 0.0, 90.0, "tilt of the table, in degrees")
 
 
 def morphology() -> tuple[Link, list[Link]]:
@@ -105,8 +109,8 @@ class Reacher(RobotEnv):
         model: str = "merged",
         render_mode: str | None = None,
     ):
-        self.gravity = require("gravity", gravity, 0.0, 20.0)
-        self.tilt = require("tilt", tilt, 0.0, 90.0)
+        self.gravity = require(SPEC.knobs["gravity"], gravity)
+        self.tilt = require(_TILT, tilt)
         self.model = require_model(model)
         strength, angle = self.gravity * GRAVITY, math.radians(self.tilt)
         pull = 0.0, -strength * math.sin(angle), -strength * math.cos(angle)
