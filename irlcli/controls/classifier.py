@@ -17,7 +17,7 @@ from irlcli.controls.variants import Method
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
 from irlcli.penalties.risk import cross_entropy
 
-# Sums over weights or over samples: of all runs together they are the sum of each run's.
+# Penalties that add up: computed for all runs at once, they are the sum of each run's.
 _ADDITIVE = ("iga", "input-gradient", "l2")
 
 

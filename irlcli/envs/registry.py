@@ -25,7 +25,9 @@ _KNOWN: dict[str, EnvironmentSpec] = {}
 
 
 def environment(name: str) -> EnvironmentSpec:
-    """The environment called ``name``. Names come from files of others: none is taken for a path.
+    """The environment called ``name``.
+
+    Names may come from untrusted files, so a name is never read as a path.
 
     Raises:
         UsageError: no environment has this name.

@@ -30,7 +30,8 @@ class Knob(NamedTuple):
         description: short noun phrase for messages.
         whole: whether only whole numbers are allowed.
         observed: what the knob adds to the observation, as in "a goal"; empty if nothing.
-        cue: its meaning, if the value is the strength of a cue and no keyword argument.
+        cue: its meaning, if the value is the strength of a cue. Its ``argument`` then only keeps a
+            setting from having two cues.
     """
 
     argument: str

@@ -66,9 +66,9 @@ def group(grouping: str, counts: Sequence[int], rng: np.random.Generator) -> lis
 def deal(counts: Sequence[int], rng: np.random.Generator) -> list[np.ndarray]:
     """For each setting e the groups [counts[e]] of its episodes.
 
-    Which episode goes to which of the E groups is random. Groups hold as many episodes of a setting
-    as each other, but for one. The first groups have that one more of every setting, so groups have
-    the settings in shares as equal as can be. No group stays empty.
+    Which episode goes to which of the E groups is random. The numbers of a setting's episodes in the
+    groups differ by at most one. The larger groups are the same for every setting, so all groups mix
+    the settings in nearly equal shares. No group stays empty.
     """
     size = len(counts)
     groups = []

@@ -28,7 +28,8 @@ class RewardModel(nn.Module):
         gamma: discount of the shaping term.
         shaping: whether f has a shaping term; otherwise f is g.
         columns: the entries of an observation that g and h see; all if there are none.
-        dropout: probability that a hidden unit is left out in training; see :meth:`train`.
+        dropout: probability that a hidden unit is left out in training mode
+            (``nn.Module.train``).
         choices: number of choices of each of K indices, in sum ``action_size``; empty if there is
             one.
 

@@ -85,7 +85,8 @@ class Penalty(NamedTuple):
         learners: ``airl`` if it has a function ``discriminator``, ``maxent`` if ``occupancy``.
         compares: whether it compares risks with each other, so that it needs at least two.
         reads: which of ``airl.penalty_scaling`` and ``airl.penalty_estimate`` can change it.
-        candidates: for lambda, as many for each penalty: a lambda means another thing in each.
+        candidates: values of lambda to choose from, the same number for each penalty, each on the
+            penalty's own scale.
         bounded: whether lambda times the penalty is bounded for any lambda, so that the loss is not
             divided by lambda.
         version: a change that alters its results must raise it. It is part of the keys of learned

@@ -1,7 +1,7 @@
 """PyBullet, imported without its banner.
 
-PyBullet's C code writes its build time to stderr on import. That line would corrupt the output of
-``--json`` for a caller who merges stderr into stdout.
+PyBullet's C code writes its build time to stderr on import. Without this module every command and
+every worker that imports it would print that line.
 """
 
 import importlib
