@@ -1,12 +1,11 @@
 """Instructions that one step of each robot executes, counted by callgrind.
 
-    python benchmarks/robot_step.py [ant half-cheetah-original mujoco-Ant mujoco-Ant-gymnasium ...]
+    python benchmarks/robot_step.py [ant half-cheetah-bullet mujoco-Ant mujoco-Ant-gymnasium ...]
 
 Counts are the difference of two run lengths, so start-up, reset and imports cancel, and they
 do not depend on what else the machine is doing. Needs ``valgrind`` on the path. Actions are
-uniform in the whole range, the same for every run. A name that ends in ``-original`` is PyBullet's
-original model, one that ends in ``-bullet`` Bullet's step under the same torques alone, one that
-ends in ``-gymnasium`` Gymnasium's own MuJoCo environment.
+uniform in the whole range, the same for every run. A name that ends in ``-bullet`` is Bullet's step
+under the same torques alone, one that ends in ``-gymnasium`` Gymnasium's own MuJoCo environment.
 """
 
 from __future__ import annotations
@@ -51,8 +50,7 @@ def make(name: str):
     from irlcli.envs.reacher.env import Reacher
 
     robots = {"ant": Ant, "half-cheetah": HalfCheetah, "reacher": Reacher}
-    robot = robots[name.removesuffix("-bullet").removesuffix("-original")]
-    return robot(model="original" if name.endswith("-original") else "merged")
+    return robots[name.removesuffix("-bullet")]()
 
 
 def roll_out(name: str, steps: int) -> None:

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from bullet_robots import ROBOTS, body, pybullet
 from gymnasium.utils.env_checker import check_env
+from original_robots import MODELS
 
 from irlcli.envs.ant.env import Ant
 from irlcli.envs.registration import transition_reward
 from irlcli.envs.vector import VectorWorlds
 
-EVERY = [(name, model) for name in ROBOTS for model in ("merged", "original")]
+EVERY = [(name, model) for name in ROBOTS for model in MODELS]
 SIZES = {"ant": (27, 8, 8), "half_cheetah": (17, 6, 9), "reacher": (9, 2, 4)}
 
 
@@ -31,7 +32,7 @@ def env(request):
 
 @pytest.mark.parametrize(("name", "model"), EVERY)
 def test_passes_gymnasiums_checker(name, model):
-    env = ROBOTS[name](model=model)
+    env = MODELS[model][name]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env, skip_render_check=True)
@@ -55,14 +56,6 @@ def test_has_the_documented_sizes(name):
     assert observation.shape == env.observation_space.shape == (SIZES[name][0],)
     assert observation.dtype == np.float32
     assert env.action_space.shape == (SIZES[name][1],)
-    env.close()
-
-
-def test_full_observation_appends_the_originals_zeros():
-    env = Ant(full_observation=True)
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (111,)
-    assert not observation[27:].any()
     env.close()
 
 

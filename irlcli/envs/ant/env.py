@@ -124,8 +124,6 @@ class Ant(RobotEnv):
     Args:
         mass, friction, goal_y, direction: see :class:`irlcli.envs.bullet.walker.Walker`.
         leg_length: multiplier of the two moving segments of each hind leg, in [0.2, 5].
-        full_observation: whether to observe the original's [111] numbers, of which 84 are zero.
-        model: ``"merged"`` or ``"original"`` (20 links; its legs cannot change).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
     Raises:
@@ -144,12 +142,9 @@ class Ant(RobotEnv):
         leg_length: float = 1.0,
         goal_y: float | None = None,
         direction: float | Sequence[float] | None = None,
-        full_observation: bool = False,
-        model: str = "merged",
         render_mode: str | None = None,
     ):
-        self._walker = Walker(mass, friction, leg_length, goal_y, direction, model)
-        self._zeros = [0.0] * 84 if full_observation else []
+        self._walker = Walker(mass, friction, leg_length, goal_y, direction)
         # What each leg adds to the sum of its links' positions, except for the hip: 2.5 upper
         # segments (its middle once, its end twice) and half a lower one. A complex number
         # represents the leg's direction in the torso's plane.
@@ -159,14 +154,13 @@ class Ant(RobotEnv):
             leg = scale * complex(x, y)
             drop = -0.5 * math.sqrt(2.0) * _LOWER * scale * sign
             self._legs.append((2.5 * _UPPER * leg, 0.5 * _LOWER * leg, drop))
-        size = 27 + len(self._zeros) + 2 * self._walker.goal.observed
-        super().__init__(World(render_mode), size, render_mode)
+        super().__init__(World(render_mode), 27 + 2 * self._walker.goal.observed, render_mode)
 
     def _place(self, positions: np.ndarray) -> Robot:
         self._goal = self._walker.goal.draw(self.np_random)
-        self._tail = self._zeros + self._walker.goal.observation(self._goal)
+        self._tail = self._walker.goal.observation(self._goal)
         start = (0.0, 0.0, _START_HEIGHT)
-        robot = self._walker.create(self._world.client, "ant.xml", morphology, start)
+        robot = self._walker.create(self._world.client, morphology, start)
         if self.render_mode is not None:
             robot.paint((0.8, 0.5, 0.3, 1.0))
         robot.place(positions)

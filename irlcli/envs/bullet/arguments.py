@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from irlcli.envs.bullet.body import single
 from irlcli.envs.bullet.knobs import WALKER_KNOBS
 
 Friction = tuple[float, float, float]
-Model = Literal["merged", "original"]
 
 
 def require_friction(friction: Sequence[float]) -> Friction:
@@ -31,18 +29,3 @@ def require_friction(friction: Sequence[float]) -> Friction:
         for kind, value in zip(kinds, friction, strict=True)
     )
     return tangential, torsional, rolling
-
-
-def require_model(model: str, leg_length: float = 1.0) -> Model:
-    """Return the name of the model.
-
-    Raises:
-        ValueError: the model is unknown, or it is the original with changed legs.
-    """
-    if model == "merged":
-        return "merged"
-    if model != "original":
-        raise ValueError(f"model must be 'merged' or 'original', not {model!r}")
-    if leg_length != 1.0:
-        raise ValueError(f"leg_length must be 1 with model='original', not {leg_length!r}")
-    return "original"

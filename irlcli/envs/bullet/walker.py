@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from irlcli.envs.arguments import require
-from irlcli.envs.bullet.arguments import require_friction, require_model
+from irlcli.envs.bullet.arguments import require_friction
 from irlcli.envs.bullet.body import Link, Vector, create_body
-from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.goal import Goal
 from irlcli.envs.bullet.knobs import LEG_LENGTH, WALKER_KNOBS
-from irlcli.envs.bullet.mjcf import load_bodies, moving_joints
 from irlcli.envs.bullet.robot import Robot
 
 Morphology = Callable[[float], tuple[Link, list[Link]]]
@@ -25,7 +23,6 @@ class Walker:
             Bullet multiplies the coefficients of two touching bodies; the floor's is 0.8.
         leg_length: multiplier of leg lengths, in [0.2, 5]; the robot decides which legs.
         goal_y, direction: see :class:`irlcli.envs.bullet.goal.Goal`.
-        model: ``"merged"`` or ``"original"``, whose legs cannot change.
 
     Raises:
         ValueError: a value is outside its range.
@@ -38,18 +35,15 @@ class Walker:
         leg_length: float,
         goal_y: float | None,
         direction: float | Sequence[float] | None,
-        model: str,
     ):
         self.mass = require(WALKER_KNOBS["mass"], mass)
         self.friction = require_friction(friction)
         self.leg_length = require(LEG_LENGTH, leg_length)
-        self.model = require_model(model, self.leg_length)
         self.goal = Goal(goal_y, direction)
 
     def create(
         self,
         client: int,
-        file: str,
         morphology: Morphology,
         position: Vector,
         passive_joints: int = 0,
@@ -58,18 +52,13 @@ class Walker:
 
         Args:
             client: Bullet's client id.
-            file: MJCF file of the original model.
-            morphology: base and links of the merged model, as a function of ``leg_length``.
-            position: position of the merged model's base.
+            morphology: base and links, as a function of ``leg_length``.
+            position: position of the base.
             passive_joints: number of leading joints that no torque acts on.
         """
-        if self.model == "original":
-            (body,) = load_bodies(client, file, pybullet.MJCF_COLORS_FROM_FILE)
-            joints = moving_joints(client, body)
-        else:
-            base, links = morphology(self.leg_length)
-            body = create_body(client, base, links, position)
-            joints = list(range(len(links)))
+        base, links = morphology(self.leg_length)
+        body = create_body(client, base, links, position)
+        joints = list(range(len(links)))
         robot = Robot(client, body, joints, joints[passive_joints:])
         robot.set_friction(self.friction)
         if self.mass != 1.0:

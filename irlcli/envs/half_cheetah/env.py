@@ -161,7 +161,6 @@ class HalfCheetah(RobotEnv):
     Args:
         mass, friction, goal_y, direction: see :class:`irlcli.envs.bullet.walker.Walker`.
         leg_length: multiplier of the lengths of both legs, in [0.2, 5].
-        model: ``"merged"`` or ``"original"`` (16 links; its legs cannot change).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
     Raises:
@@ -180,10 +179,9 @@ class HalfCheetah(RobotEnv):
         leg_length: float = 1.0,
         goal_y: float | None = None,
         direction: float | Sequence[float] | None = None,
-        model: str = "merged",
         render_mode: str | None = None,
     ):
-        self._walker = Walker(mass, friction, leg_length, goal_y, direction, model)
+        self._walker = Walker(mass, friction, leg_length, goal_y, direction)
         super().__init__(World(render_mode), 17 + 2 * self._walker.goal.observed, render_mode)
 
     def _place(self, positions: np.ndarray) -> Robot:
@@ -192,9 +190,7 @@ class HalfCheetah(RobotEnv):
         self._tail = self._walker.goal.observation(goal)
         start = (0.0, 0.0, 0.0)
         # The first three joints move the torso: forward, up and in pitch.
-        robot = self._walker.create(
-            self._world.client, "half_cheetah.xml", morphology, start, passive_joints=3
-        )
+        robot = self._walker.create(self._world.client, morphology, start, passive_joints=3)
         if self.render_mode is not None:
             robot.paint((0.8, 0.6, 0.4, 1.0))
         robot.place(positions)
@@ -216,5 +212,5 @@ class HalfCheetah(RobotEnv):
         return observation, positions[0] - speeds[0] * TIME_STEP / SUBSTEPS
 
     def _focus(self) -> Vector:
-        link = _TORSO_LINK if self._walker.model == "merged" else _TORSO_LINK + 1
-        return pybullet.getLinkState(self._robot.body, link, physicsClientId=self._world.client)[0]
+        body, client = self._robot.body, self._world.client
+        return pybullet.getLinkState(body, _TORSO_LINK, physicsClientId=client)[0]

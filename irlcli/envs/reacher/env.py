@@ -11,7 +11,6 @@ import math
 import numpy as np
 
 from irlcli.envs.arguments import require
-from irlcli.envs.bullet.arguments import require_model
 from irlcli.envs.bullet.body import (
     FROM_TO_MARGIN,
     Capsule,
@@ -23,7 +22,6 @@ from irlcli.envs.bullet.body import (
 )
 from irlcli.envs.bullet.engine import pybullet
 from irlcli.envs.bullet.episode import RobotEnv
-from irlcli.envs.bullet.mjcf import load_bodies
 from irlcli.envs.bullet.robot import Robot
 from irlcli.envs.bullet.world import GRAVITY, TIME_STEP, World
 from irlcli.envs.reacher.spec import SPEC
@@ -90,7 +88,6 @@ class Reacher(RobotEnv):
     Args:
         gravity: multiplier of 9.8 m/s^2, in [0, 20]. The original has none.
         tilt: tilt of the table, degrees in [0, 90].
-        model: ``"merged"`` or ``"original"`` (5 links).
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
 
     Raises:
@@ -106,12 +103,10 @@ class Reacher(RobotEnv):
         self,
         gravity: float = 1.0,
         tilt: float = 5.0,
-        model: str = "merged",
         render_mode: str | None = None,
     ):
         self.gravity = require(SPEC.knobs["gravity"], gravity)
         self.tilt = require(_TILT, tilt)
-        self.model = require_model(model)
         strength, angle = self.gravity * GRAVITY, math.radians(self.tilt)
         pull = 0.0, -strength * math.sin(angle), -strength * math.cos(angle)
         world = World(render_mode, pull, substeps=1, ground=False)
@@ -120,13 +115,6 @@ class Reacher(RobotEnv):
     def _place(self, positions: np.ndarray) -> Robot:
         self._target = float(positions[2]), float(positions[3])
         client = self._world.client
-        if self.model == "original":
-            *_, arm, target = load_bodies(client, "reacher.xml")
-            for joint, position in enumerate(self._target):
-                pybullet.resetJointState(target, joint, position, physicsClientId=client)
-            robot = Robot(client, arm, (0, 2), (0, 2))
-            robot.place(positions[:2])
-            return robot
         arm = create_body(client, *morphology(), (0.0, 0.0, 0.0))
         for link in range(2):
             # The original's arm does not collide with anything.
