@@ -92,8 +92,8 @@ def run(job: Job) -> None:
         invariant, hidden = trained, c.hidden
     else:
         schedule = classifier.Schedule(c.unit_steps, c.unit_steps // 4, c.learning_rate)
-        test = next(t for t in cued_labels.UNIT_TESTS if t.name == p.problem)
-        trained, unseen = cued_labels.unit_test(test, seeds, c.unit_samples)
+        draw = cued_labels.UNIT_TESTS[p.problem]
+        trained, unseen = cued_labels.unit_test(draw, seeds, c.unit_samples)
         invariant, hidden = cued_labels.permuted(trained.numpy(), seeds), 0
 
     def rows_of(method: Method) -> list[dict[str, Any]]:
