@@ -58,9 +58,8 @@ class RewardModel(nn.Module):
         self.state_only = state_only
         self.gamma = gamma
         self.normaliser = ObservationNormaliser(observation_size)
-        self.choices = tuple(choices) or (action_size,)
-        self.several = bool(choices)
-        if sum(self.choices) != action_size or (choices and not discrete):
+        self.choices = tuple(choices)
+        if choices and (sum(choices) != action_size or not discrete):
             raise ValueError(f"choices {list(choices)} are not those of {action_size} actions")
         self.columns = list(columns)
         if any(not -observation_size <= column < observation_size for column in columns):
@@ -75,7 +74,8 @@ class RewardModel(nn.Module):
         """Actions as vectors [B, A]: one-hot if discrete, those of several indices side by side."""
         if not self.discrete:
             return actions
-        parts = zip(actions.unbind(-1) if self.several else (actions,), self.choices, strict=True)
+        indices = actions.unbind(-1) if self.choices else (actions,)
+        parts = zip(indices, self.choices or (self.action_size,), strict=True)
         # one_hot() of any batch size cannot be exported: it looks at the largest index.
         return torch.cat([part[..., None] == torch.arange(n) for part, n in parts], -1).float()
 
@@ -141,7 +141,7 @@ class AveragedReward(nn.Module):
         self.observation_size = members[0].observation_size
         self.action_size = members[0].action_size
         self.discrete = members[0].discrete
-        self.choices, self.several = members[0].choices, members[0].several
+        self.choices = members[0].choices
 
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
         """As :meth:`RewardModel.encode`."""

@@ -28,7 +28,7 @@ def write_reward(path: Path, module: StandaloneReward, about: dict[str, object])
     observations, following = torch.zeros(_EXAMPLES, size), torch.zeros(_EXAMPLES, size)
     actions = torch.zeros(_EXAMPLES, model.action_size)
     if model.discrete:
-        shape = [len(model.choices)] if model.several else []
+        shape = [len(model.choices)] if model.choices else []
         actions = torch.zeros(_EXAMPLES, *shape, dtype=torch.int64)
     arguments = observations, actions, following, torch.zeros(_EXAMPLES, dtype=torch.bool)
     batch = torch.export.Dim("batch")
