@@ -4,16 +4,13 @@ import json
 import math
 import sys
 
-import numpy as np
 import pytest
 
 from benchmarks.peers.__main__ import enough, main
-from benchmarks.peers.absorbing import AbsorbingState
 from benchmarks.peers.checks import first_kept, share
 from benchmarks.peers.ours import requested
 from benchmarks.peers.results import read_run, tables, until_text, write
 from benchmarks.peers.tasks import METHODS, ROWS, chosen, tasks
-from irlcli.envs.lunar_lander.env import LunarLander
 from irlcli.errors import Busy, UsageError
 from irlcli.store.lock import locked
 
@@ -137,24 +134,6 @@ def test_one_process_at_a_time(tmp_path, monkeypatch, capsys):
         main()
     assert str(tmp_path / "runs") in capsys.readouterr().err
     assert unfinished.exists()
-
-
-def test_an_absorbing_state_repeats_the_terminal_observation():
-    plain, absorbing = LunarLander(), AbsorbingState(LunarLander())
-    expected, _ = plain.reset(seed=1)
-    observation, _ = absorbing.reset(seed=1)
-    terminated, after = False, 0
-    while after < 5:
-        if terminated:
-            reward, after = 0.0, after + 1
-        else:
-            expected, reward, terminated, *_ = plain.step(0)
-        observation, paid, *ended, _ = absorbing.step(3 if after else 0)
-        np.testing.assert_array_equal(observation, expected)
-        assert (paid, ended) == (reward, [False, False])
-    observation, _ = absorbing.reset(seed=1)
-    np.testing.assert_array_equal(observation, plain.reset(seed=1)[0])
-    np.testing.assert_array_equal(absorbing.step(2)[0], plain.step(2)[0])
 
 
 @pytest.mark.parametrize("method", ["airl", "airl-plain"])

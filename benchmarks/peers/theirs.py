@@ -10,9 +10,9 @@ best known, LunarLander: imitation tuned nothing for it. The discriminator's val
     imitation's tutorials, the generator's those of rl-baselines3-zoo for LunarLander-v2.
 PPO: rl-baselines3-zoo, ``hyperparams/ppo.yml``, LunarLander-v2 and HalfCheetahBulletEnv-v0.
 
-imitation wants episodes of equal length and names absorbing states as the way there (seals'
-AbsorbAfterDoneWrapper). So LunarLander's episodes last 1000 steps here, and demonstrated episodes
-end with their last observation and action repeated. ``variable`` instead passes
+imitation wants episodes of equal length and names absorbing states as the way there, by a wrapper of
+seals, which it requires. So LunarLander's episodes last 1000 steps here, and demonstrated episodes end
+with their last observation and action repeated. ``variable`` instead passes
 ``allow_variable_horizon``, as most users' scripts do.
 
 Its learners take worlds of one kind: they get equal shares of the worlds of all settings, and the
@@ -41,12 +41,12 @@ from imitation.policies.base import FeedForward32Policy, NormalizeFeaturesExtrac
 from imitation.rewards.reward_nets import BasicRewardNet, BasicShapedRewardNet, NormalizedRewardNet
 from imitation.util import logger
 from imitation.util.networks import RunningNorm
+from seals.util import AbsorbAfterDoneWrapper
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from benchmarks.peers.absorbing import AbsorbingState
 from benchmarks.peers.checks import Checks, Ended
 from irlcli.envs.registration import build
 from irlcli.envs.registry import environment
@@ -202,7 +202,7 @@ def _worlds(run: dict[str, Any], count: int, fixed: bool = False) -> DummyVecEnv
     def make(index: int) -> TimeLimit:
         setting = settings[index * len(settings) // count]
         world = build(spec, env_kwargs(env, setting), str(setting))
-        return TimeLimit(AbsorbingState(world) if fixed else world, spec.max_episode_steps)
+        return TimeLimit(AbsorbAfterDoneWrapper(world) if fixed else world, spec.max_episode_steps)
 
     venv = DummyVecEnv([functools.partial(make, i) for i in range(count)])
     venv.seed(run["seed"])
