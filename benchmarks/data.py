@@ -36,7 +36,8 @@ from irlcli.store import Store
 ENV = "half-cheetah"
 SETTINGS = parse_settings(ENV, "leg-length=0.7,1.3")
 BUDGET = 3.0
-PARTS = ("bare write", "import", "export parquet", "import minari", "export minari")
+# In the order in which they run: what is imported must have been exported.
+PARTS = ("bare write", "import", "export parquet", "export minari", "import minari")
 
 
 def main() -> None:
@@ -56,13 +57,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as directory:
             write_source(Path(directory) / "source.parquet", steps, arguments.length)
             os.environ["MINARI_DATASETS_PATH"] = str(Path(directory) / "minari")
-            for part in (
-                "bare write",
-                "import",
-                "export parquet",
-                "export minari",
-                "import minari",
-            ):
+            for part in PARTS:
                 runs = [in_a_process(part, directory) for _ in range(3)]
                 found[steps][part] = min(runs, key=lambda run: run["seconds"])
     few, many = counts
