@@ -27,7 +27,7 @@ from irlcli.data.exchange.transitions import write_transitions
 from irlcli.data.steps import PIECE, Steps, nowhere
 from irlcli.data.streaming import read_stream
 from irlcli.envs.registration import make
-from irlcli.experiments.references import recorded
+from irlcli.experiments.recordings import recorded
 from irlcli.experiments.runner import Runner
 from irlcli.interventions import parse_settings
 from irlcli.stages import import_demonstrations

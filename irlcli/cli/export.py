@@ -14,6 +14,7 @@ from irlcli.cli.session import Session
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
+from irlcli.experiments.recordings import minari_directory
 from irlcli.experiments.status import checked
 
 
@@ -61,7 +62,7 @@ def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
 def _demos_to_minari(session: Session, ref: str, name: str) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
     directory = checked(session.store, source)
-    dataset = references.minari_directory(name).parent
+    dataset = minari_directory(name).parent
     if os.path.lexists(dataset):
         raise UsageError(f"Minari has a dataset {name!r} already", "raise its version: -v1")
     dataset.parent.mkdir(parents=True, exist_ok=True)

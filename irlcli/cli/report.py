@@ -173,7 +173,8 @@ def _table2(session: StageSession, form: str | None) -> None:
 
 
 def _returns(session: StageSession, refs: Sequence[str]) -> None:
-    from irlcli.experiments.references import by_own_reward, circumstances, evaluation
+    from irlcli.experiments.circumstances import by_own_reward, circumstances
+    from irlcli.experiments.references import evaluation
     from irlcli.report.returns import as_json
 
     named = [evaluation(session.store, ref) for ref in refs]

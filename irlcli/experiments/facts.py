@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from irlcli import labels
-from irlcli.experiments.references import flat
+from irlcli.experiments.circumstances import flat
 from irlcli.methods import method_name
 from irlcli.report.parameters import Code, Others, Run
 from irlcli.store import Artefact, KeyRecord, digest

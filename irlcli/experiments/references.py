@@ -6,21 +6,15 @@ which is read without a tensor library. A foreign file has to be loaded.
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import Literal, overload
 
 from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.introduce import introduce
 from irlcli.experiments.status import foreign_source, source_in
 from irlcli.stages.base import Source
-from irlcli.store import Artefact, Index, Store, read_json
-
-if TYPE_CHECKING:
-    from irlcli.stages.import_demonstrations import Form
+from irlcli.store import Artefact, Store, read_json
 
 
 @overload
@@ -194,72 +188,6 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
     return source_in(artefact, None), about.env, list(about.settings)
 
 
-def recorded(texts: Sequence[str]) -> tuple[Form, list[Source]]:
-    """The sources of an import, ``FILE.parquet``, ``minari:DATASET`` or a directory, and their form.
-
-    Raises:
-        NotFound: a source does not exist.
-        UsageError: sources of several forms, or of none.
-    """
-    if not texts:
-        raise UsageError(
-            "no demonstrations to import", "name a file, a directory or minari:DATASET"
-        )
-    found = [(_form(text), _recorded(text)) for text in texts]
-    forms = sorted({form for form, _ in found})
-    if len(forms) > 1:
-        raise UsageError(
-            f"the sources are of several forms: {', '.join(forms)}", "import them one at a time"
-        )
-    return found[0][0], [source for _, source in found]
-
-
-def _form(text: str) -> Form:
-    if text.startswith("minari:"):
-        return "minari"
-    return "imitation" if Path(text).is_dir() else "parquet"
-
-
-def _recorded(text: str) -> Source:
-    if text.startswith("minari:"):
-        path = minari_directory(text.removeprefix("minari:"))
-        hint = f"`minari download {text.removeprefix('minari:')}`, or set MINARI_DATASETS_PATH"
-    else:
-        path = Path(text)
-        hint = "name a Parquet file, minari:DATASET, or a directory of imitation's trajectories"
-    if not path.exists():
-        raise NotFound(f"there is nothing at {path}", hint)
-    source = foreign_source(path)
-    if path.is_file() and not _is_parquet(path):
-        raise UsageError(f"{path} is not a Parquet file", hint)
-    if _form(text) == "imitation":
-        from irlcli.data.exchange.imitation import STATE
-
-        if not (path / STATE).is_file():
-            raise UsageError(f"{path} holds no trajectories of imitation: no {STATE}", hint)
-    return source
-
-
-def _is_parquet(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(4) == b"PAR1"
-
-
-def minari_directory(dataset: str) -> Path:
-    """Where Minari keeps the data of a dataset on this machine.
-
-    Raises:
-        UsageError: the name of no dataset.
-    """
-    # Minari takes no namespace of one character.
-    if not re.fullmatch(r"(?![^/]/[^/]*$)(?:[-\w]+/)*[-\w]+-v\d+", dataset):
-        raise UsageError(
-            f"{dataset!r} is not the name of a Minari dataset", "write minari:me/hopper-mass-v0"
-        )
-    root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
-    return Path(root) / dataset / "data"
-
-
 def evaluation(store: Store, ref: str) -> tuple[Artefact, descriptions.Evaluation]:
     """The evaluation that ``ref`` names, and its summary.
 
@@ -291,59 +219,6 @@ def summary(store: Store, artefact: Artefact) -> descriptions.Evaluation:
     introduce(artefact)
     path = store.open(artefact, _required(artefact, "summary.json"))
     return descriptions.parse(read_json(path), descriptions.Evaluation, path)
-
-
-def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
-    """The parameters behind an evaluation that all its seeds share, by ``STAGE.FIELD``.
-
-    They exclude the seeds, and a lambda that was chosen for each seed. An input from outside the
-    store contributes only its content. The names for a reward other than the policy's own begin
-    with ``reward.``.
-    """
-    found: dict[str, Any] = {}
-    pending = [(artefact, "")]
-    while pending:
-        at, prefix = pending.pop()
-        record = at.manifest.record
-        for name, value in flat(record.parameters):
-            chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
-            if name not in ("seed", "settings", "setting") and not chosen:
-                found[f"{prefix}{record.stage}.{name}"] = value
-        for role in ("policy", "reward", "demonstrations"):
-            measures = record.stage == "evaluate" and role == "reward"
-            sha = record.inputs.get(role)
-            if sha is None or (measures and by_own_reward(at, index)):
-                continue
-            makers = index.holders(sha)
-            if role == "demonstrations":
-                found[f"{prefix}{record.stage}.{role}"] = sha
-            elif makers:
-                pending.append((makers[0], "reward." if measures else prefix))
-    return found
-
-
-def by_own_reward(evaluation: Artefact, index: Index) -> bool:
-    """Whether the policy was trained on the reward that the evaluation scored it by."""
-    inputs = evaluation.manifest.record.inputs
-    if "reward" not in inputs or "policy" not in inputs:
-        return False
-    return any(
-        inputs["reward"] in (maker.manifest.record.inputs.get("reward"), *_contents(maker))
-        for maker in index.holders(inputs["policy"])
-    )
-
-
-def _contents(artefact: Artefact) -> list[str]:
-    return [output.sha256 for output in artefact.manifest.outputs]
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The leaves of nested parameters, by dotted name."""
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", list(value) if isinstance(value, tuple | list) else value
 
 
 def output(

@@ -7,7 +7,8 @@ from irlcli.configs.load import field_of
 from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
-from irlcli.experiments.references import output, recorded
+from irlcli.experiments.recordings import recorded
+from irlcli.experiments.references import output
 from irlcli.interventions import parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession, check_path

@@ -7,6 +7,7 @@ from irlcli import labels
 from irlcli.data.descriptions import Evaluation, Reward
 from irlcli.errors import UsageError
 from irlcli.experiments import references
+from irlcli.experiments.circumstances import by_own_reward
 from irlcli.interventions import Setting, check_observed, parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import Session, StageSession
@@ -74,7 +75,7 @@ def evaluate(
 def measured(session: Session, artefact: Artefact) -> tuple[Evaluation, dict[str, Any], bool]:
     """An evaluation for :func:`irlcli.report.returns.rows`."""
     scored = "reward" in artefact.manifest.record.inputs
-    own = scored and references.by_own_reward(artefact, session.store.index())
+    own = scored and by_own_reward(artefact, session.store.index())
     return references.summary(session.store, artefact), {}, own
 
 

@@ -1,0 +1,61 @@
+"""What stands behind an evaluation, so that only comparable ones share a line of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from irlcli.store import Artefact, Index
+
+
+def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
+    """The parameters behind an evaluation that all its seeds share, by ``STAGE.FIELD``.
+
+    They exclude the seeds, and a lambda that was chosen for each seed. An input from outside the
+    store contributes only its content. The names for a reward other than the policy's own begin
+    with ``reward.``.
+    """
+    found: dict[str, Any] = {}
+    pending = [(artefact, "")]
+    while pending:
+        at, prefix = pending.pop()
+        record = at.manifest.record
+        for name, value in flat(record.parameters):
+            chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
+            if name not in ("seed", "settings", "setting") and not chosen:
+                found[f"{prefix}{record.stage}.{name}"] = value
+        for role in ("policy", "reward", "demonstrations"):
+            measures = record.stage == "evaluate" and role == "reward"
+            sha = record.inputs.get(role)
+            if sha is None or (measures and by_own_reward(at, index)):
+                continue
+            makers = index.holders(sha)
+            if role == "demonstrations":
+                found[f"{prefix}{record.stage}.{role}"] = sha
+            elif makers:
+                pending.append((makers[0], "reward." if measures else prefix))
+    return found
+
+
+def by_own_reward(evaluation: Artefact, index: Index) -> bool:
+    """Whether the policy was trained on the reward that the evaluation scored it by."""
+    inputs = evaluation.manifest.record.inputs
+    if "reward" not in inputs or "policy" not in inputs:
+        return False
+    return any(
+        inputs["reward"] in (maker.manifest.record.inputs.get("reward"), *_contents(maker))
+        for maker in index.holders(inputs["policy"])
+    )
+
+
+def _contents(artefact: Artefact) -> list[str]:
+    return [output.sha256 for output in artefact.manifest.outputs]
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of nested parameters, by dotted name."""
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", list(value) if isinstance(value, tuple | list) else value
