@@ -2,16 +2,16 @@
 
 from irlcli.configs.load import CONTROL, unseen_settings
 from irlcli.experiments.rows import Task, made_by
-from irlcli.experiments.variants import Configs
+from irlcli.experiments.variants import ConfigOf
 from irlcli.interventions import parse_settings
 from irlcli.stages import control, figure2
 from irlcli.stages.base import Request
 
 
-def gridworld_figure(configs: Configs) -> tuple[list[Task], Request]:
+def gridworld_figure(config_of: ConfigOf) -> tuple[list[Task], Request]:
     """The datasets and the sweep of Figure 2, and the figure itself."""
     env = "gridworld"
-    config = configs(env, None)
+    config = config_of(env, None)
     trained = parse_settings(env, f"path-group={','.join(config.interventions['path-group'].id)}")
     unseen = unseen_settings(env, config)
     figure = figure2.request(env, trained, unseen, config)
@@ -23,9 +23,9 @@ def gridworld_figure(configs: Configs) -> tuple[list[Task], Request]:
     return [*tasks, Task("figure2.sweep", "rewards", sweep)], figure
 
 
-def controls(configs: Configs) -> tuple[list[Task], Request]:
+def controls(config_of: ConfigOf) -> tuple[list[Task], Request]:
     """The parts of the positive controls, and their report."""
-    report = control.request(configs(CONTROL, None).control)
+    report = control.request(config_of(CONTROL, None).control)
     tasks = [
         Task(f"control.{name}", "rewards", made_by(part)) for name, part in report.inputs.items()
     ]

@@ -10,7 +10,7 @@ from irlcli.experiments import figures, rows
 from irlcli.experiments.rows import PHASES, Chosen, RewardRun, Task
 from irlcli.experiments.status import Identities, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
-from irlcli.experiments.variants import Configs, Overridable, configs_of, step_name
+from irlcli.experiments.variants import ConfigOf, Overridable, config_under, step_name
 from irlcli.stages import choose_penalty
 from irlcli.stages.base import From, Request
 
@@ -52,8 +52,8 @@ class Plan:
         self.selection = selection
         self.lookup = lookup
         self._load = load
-        self._configs = _cached(lambda env, flags: load(env, flags, ()))
-        self._under = {v: _cached(configs_of(v, load)) for v in table.variants}
+        self._config_of = _cached(lambda env, flags: load(env, flags, ()))
+        self._under = {v: _cached(config_under(v, load)) for v in table.variants}
         self._weighted = {
             method: _cached(partial(_with_weight, load, weight))
             for method, weight in table.penalty_weights.items()
@@ -97,23 +97,23 @@ class Plan:
 
     def _all_tasks(self) -> Iterator[Task]:
         if self.table.kind == "figure2":
-            tasks, self.figure = figures.gridworld_figure(self._configs)
+            tasks, self.figure = figures.gridworld_figure(self._config_of)
             yield from tasks
         elif self.table.kind == "control":
-            tasks, self.figure = figures.controls(self._configs)
+            tasks, self.figure = figures.controls(self._config_of)
             yield from tasks
         for row in self.table.rows:
             if not self._may_hold(f"{row}."):
                 continue
             if self.table.kind == "experts":
-                yield from rows.experts(row, self._configs)
+                yield from rows.experts(row, self._config_of)
                 continue
             yield from rows.comparison(
                 row,
                 self.table.measures,
                 self.table.retrainings,
                 self._runs(row),
-                self._configs,
+                self._config_of,
                 Chosen(self.selection.candidates, self.lookup),
             )
 
@@ -128,7 +128,7 @@ class Plan:
             for method in methods
             for seed in seeds
         ] or [
-            RewardRun(method, method, seed, str(row), self._weighted.get(method, self._configs))
+            RewardRun(method, method, seed, str(row), self._weighted.get(method, self._config_of))
             for method in methods
             for seed in seeds
         ]
@@ -157,10 +157,10 @@ class Plan:
             pending += self.needs[name]
         self.tasks = {name: task for name, task in self.tasks.items() if name in kept}
 
-    def configs(self, env: str) -> Config:
+    def config(self, env: str) -> Config:
         """The config of ``env``, without any method's flags: the base's, if there are variants."""
         variants = self.table.variants
-        return (self._under[variants[0]] if variants else self._configs)(env, None)
+        return (self._under[variants[0]] if variants else self._config_of)(env, None)
 
     def step(self, name: str) -> Step:
         """The state of the step called ``name``; what it waits for is named as in the plan."""
@@ -179,10 +179,10 @@ class Plan:
         return self.tasks[name].request.stage == choose_penalty.STAGE
 
 
-def _cached(configs: Configs) -> Configs:
+def _cached(config_of: ConfigOf) -> ConfigOf:
     @cache
     def load(env: str, flags: tuple[tuple[str, Any], ...]) -> Config:
-        return configs(env, dict(flags))
+        return config_of(env, dict(flags))
 
     def cached(env: str, flags: Mapping[str, Any] | None) -> Config:
         return load(env, tuple((flags or {}).items()))

@@ -77,7 +77,7 @@ def _experts(
         )
     experts: dict[str, ExpertConfig] = {}
     for row in plan.table.rows:
-        config = plan.configs(row.env)
+        config = plan.config(row.env)
         own = config.interventions[row.knob].expert
         experts[f"{row.env} {row.knob}"] = config.expert if own is None else own
     parameters = report_experts.Parameters(
@@ -144,7 +144,7 @@ def _artefacts(plan: Plan) -> dict[str, Artefact]:
 def _rows(plan: Plan) -> list[Row]:
     rows = []
     for row in plan.table.rows:
-        config = plan.configs(row.env)
+        config = plan.config(row.env)
         listed = config.interventions[row.knob]
         trained, unseen = (
             listed_settings(row.env, row.knob, values) for values in (listed.id, listed.ood)

@@ -29,7 +29,7 @@ from irlcli.errors import UsageError
 from irlcli.experiments.bank import Member, Policies, bank
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
-from irlcli.experiments.variants import Configs
+from irlcli.experiments.variants import ConfigOf
 from irlcli.interventions import Setting, listed_settings
 from irlcli.methods import fields, method
 from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
@@ -77,14 +77,14 @@ class RewardRun(NamedTuple):
     Attributes:
         agent: the method or the variant, as the report's cells call it.
         shared: the part of the steps' names that all seeds share.
-        configs: those of the variant.
+        config_of: the configs of the variant.
     """
 
     agent: str
     method: str
     seed: int
     shared: str
-    configs: Configs
+    config_of: ConfigOf
 
     @property
     def name(self) -> str:
@@ -113,9 +113,9 @@ class Chosen(NamedTuple):
 class _RowRequests:
     """The requests about the experts of one row, each made once."""
 
-    def __init__(self, row: Row, configs: Configs):
+    def __init__(self, row: Row, config_of: ConfigOf):
         self.row = row
-        self.config = configs(row.env, None)
+        self.config = config_of(row.env, None)
         if row.knob not in self.config.interventions:
             own = environment(row.env).own
             file = f"settings/{row.env}.toml" if own is None else own.source
@@ -203,7 +203,7 @@ def comparison(
     measures: Sequence[str],
     retrainings: int,
     runs: Sequence[RewardRun],
-    configs: Configs,
+    config_of: ConfigOf,
     chosen: Chosen,
 ) -> Iterator[Task]:
     """The tasks of a row that compares ``runs``; each after what it needs.
@@ -214,7 +214,7 @@ def comparison(
         UsageError: the settings list no values of the knob, or not one unseen one; or a config is
             contradictory.
     """
-    requests = _RowRequests(row, configs)
+    requests = _RowRequests(row, config_of)
     trained, unseen = requests.trained, requests.unseen
     if not trained or len(unseen) != 1:
         raise UsageError(
@@ -225,12 +225,12 @@ def comparison(
     demos = collect_experts.request(row.env, trained, requests.config, 0, requests.listed.episodes)
     yield Task(f"{row}.demos", "demos", demos)
     yield from _without_reward(requests, measures)
-    under = {configs: requests}
+    under = {config_of: requests}
     for run in runs:
         try:
-            if run.configs not in under:
-                under[run.configs] = _RowRequests(row, run.configs)
-            yield from _run(under[run.configs], demos, run, measures, retrainings, chosen)
+            if run.config_of not in under:
+                under[run.config_of] = _RowRequests(row, run.config_of)
+            yield from _run(under[run.config_of], demos, run, measures, retrainings, chosen)
         except UsageError as error:
             raise UsageError(f"{row}, {run.agent}: {error.message}", error.hint) from None
 
@@ -276,7 +276,7 @@ def _run(
         yield Task(run.name, "rewards", cloned)
         yield from _imitation(_Reward(requests, demos, cloned, run, measures), {})
         return
-    airl = run.configs(env, fields(run.method, "airl")).airl_of(trained)
+    airl = run.config_of(env, fields(run.method, "airl")).airl_of(trained)
     basis = {}
     if chosen.candidates and airl.penalty != "none":
         choice = choose_penalty.request(
@@ -437,9 +437,9 @@ def _choice(name: str, choice: Request) -> Iterator[Task]:
     yield Task(name, "rewards", choice)
 
 
-def experts(row: Row, configs: Configs) -> Iterator[Task]:
+def experts(row: Row, config_of: ConfigOf) -> Iterator[Task]:
     """The experts of a row's settings, and what they, the random and the idle agent earn there."""
-    requests = _RowRequests(row, configs)
+    requests = _RowRequests(row, config_of)
     for measure, places in (("id", requests.trained), ("ood", requests.unseen)):
         if not places:
             continue

@@ -19,7 +19,7 @@ _NAME = r"[a-z0-9]+([ -][a-z0-9]+)*"
 _LONGEST = 40
 
 # The config of an environment, under flags such as ``airl.penalty``.
-Configs = Callable[[str, Mapping[str, Any] | None], Config]
+ConfigOf = Callable[[str, Mapping[str, Any] | None], Config]
 # The same, under overrides as ``--set`` takes them.
 Overridable = Callable[[str, Mapping[str, Any] | None, Sequence[str]], Config]
 
@@ -102,7 +102,7 @@ def step_name(variant: Variant) -> str:
     return variant.name.replace(" ", "-")
 
 
-def configs_of(variant: Variant, load: Overridable) -> Configs:
+def config_under(variant: Variant, load: Overridable) -> ConfigOf:
     """The configs under ``variant``.
 
     Challengers learn as ``[transfer.ppo]`` says. Still, what a variant changes in ``transfer``
@@ -110,7 +110,7 @@ def configs_of(variant: Variant, load: Overridable) -> Configs:
     """
     learning = [item for item in variant.overrides if field_of(item).startswith("airl.")]
 
-    def configs(env: str, flags: Mapping[str, Any] | None) -> Config:
+    def config_of(env: str, flags: Mapping[str, Any] | None) -> Config:
         config, learned = load(env, flags, variant.overrides), load(env, flags, learning)
         interventions = {
             knob: msgspec.structs.replace(listed, airl=learned.interventions[knob].airl)
@@ -118,4 +118,4 @@ def configs_of(variant: Variant, load: Overridable) -> Configs:
         }
         return msgspec.structs.replace(config, airl=learned.airl, interventions=interventions)
 
-    return configs
+    return config_of
