@@ -23,7 +23,9 @@ def assess(
     ] = None,
     intervention: Annotated[
         str | None,
-        typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (ID values). Default: trained in."),
+        typer.Option(
+            help="Settings: KNOB=VALUE,..., or KNOB (training values). Default: trained in."
+        ),
     ] = None,
     setting: OneSetting = [],  # noqa: B006
     demos: Annotated[

@@ -16,7 +16,9 @@ def collect_experts(
     env: RequiredEnv,
     intervention: Annotated[
         str | None,
-        typer.Option(help="KNOB=VALUE,VALUE, or KNOB for its ID values in the settings file."),
+        typer.Option(
+            help="KNOB=VALUE,VALUE, or KNOB for its training values in the settings file."
+        ),
     ] = None,
     setting: OneSetting = [],  # noqa: B006
     expert: Annotated[

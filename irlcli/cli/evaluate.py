@@ -19,7 +19,7 @@ def evaluate(
     trained_in: Annotated[
         str | None,
         typer.Option(
-            help="With --expert: the experts of KNOB=VALUE,... or KNOB (ID values), each in all "
+            help="With --expert: the experts of KNOB=VALUE,... or KNOB (training values), each in all "
             "settings."
         ),
     ] = None,
@@ -38,7 +38,7 @@ def evaluate(
         ),
     ] = None,
     intervention: Annotated[
-        str | None, typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (ID values).")
+        str | None, typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (training values).")
     ] = None,
     setting: OneSetting = [],  # noqa: B006
     env: Env = None,

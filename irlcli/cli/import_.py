@@ -25,7 +25,7 @@ def import_(
     intervention: Annotated[
         str | None,
         typer.Option(
-            help="Settings of the episodes: KNOB=VALUE,VALUE, or KNOB for its ID values in the "
+            help="Settings of the episodes: KNOB=VALUE,VALUE, or KNOB for its training values in the "
             "settings file."
         ),
     ] = None,

@@ -22,7 +22,7 @@ from irlcli.configs.schema import (
     TransferConfig,
 )
 from irlcli.envs.registry import environment
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import UsageError, closest, suggest
 from irlcli.interventions import Setting, knob_of, listed_settings, overlap
 
 PROFILES = ("smoke", "standard", "paper")
@@ -350,8 +350,10 @@ def _override(item: str) -> tuple[str, Any]:
             )
         fields = {f.name: f.type for f in msgspec.structs.fields(kind)}
         if name not in fields:
-            homes = [f"{home}.{name}" for home in _homes(name)] if len(path) == 1 else []
-            hint = f"did you mean {' or '.join(homes)}?" if homes else suggest(name, fields)
+            near = [f"{home}.{name}" for home in _homes(name)] if len(path) == 1 else []
+            if (close := closest(name, fields)) and not near:
+                near = [".".join((*path[:i], close, *path[i + 1 :]))]
+            hint = f"did you mean {' or '.join(near)}?" if near else suggest(name, fields)
             raise UsageError(f"--set {item!r}: unknown field {dotted!r}", hint)
         kind = fields[name]
         if kind == _INTERVENTIONS:

@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast, get_args
 
 import msgspec
 from msgspec import Meta, Struct
@@ -54,7 +54,7 @@ class _Knob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
     """``[knobs.NAME]``: fields of :class:`irlcli.envs.spec.Knob`."""
 
     argument: str
-    forms: Annotated[tuple[Form, ...], Meta(min_length=1)]
+    forms: Annotated[tuple[str, ...], Meta(min_length=1)]
     low: _Number
     high: _Number
     description: str = ""
@@ -65,7 +65,7 @@ class _Knob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
         """The knob called ``name``."""
         return Knob(
             argument=self.argument,
-            forms=self.forms,
+            forms=cast(tuple[Form, ...], self.forms),
             low=self.low,
             high=self.high,
             description=self.description or name,
@@ -214,6 +214,11 @@ def _knob(name: str, value: Any) -> _Knob:
             "up to 40 letters, digits, '-' and '_', a letter first",
         )
     knob = converted(value, _Knob, f"knobs.{name}", _EXAMPLES)
+    for form in knob.forms:
+        if form not in get_args(Form):
+            raise UsageError(
+                f"knobs.{name}.forms: unknown form {form!r}", suggest(form, get_args(Form))
+            )
     if not knob.argument.isidentifier():
         raise UsageError(
             f"knobs.{name}.argument: {knob.argument!r} is not a keyword argument",

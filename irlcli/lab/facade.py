@@ -109,7 +109,7 @@ class Lab:
 
         Args:
             env: environment, or a TOML file that describes one.
-            intervention: ``engine-power=1x,1.25x``, or a knob for its ID values in the settings file.
+            intervention: ``engine-power=1x,1.25x``, or a knob for its training values in the settings file.
             setting: settings of several knobs, each ``mass=2x,friction=0.5``.
             expert: experts of settings, instead of training them: policies, or ``.zip`` files of
                 stable-baselines3, which need ``trust``: loading runs the code in them.

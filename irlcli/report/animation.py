@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -62,10 +63,13 @@ def film(
             environment draws no pictures.
     """
     with ExitStack() as stack:
-        worlds = [
-            stack.enter_context(closing(envs.make(env, setting, render_mode="rgb_array")))
-            for setting in settings
-        ]
+        with warnings.catch_warnings():
+            # Gymnasium's, of an environment without pictures; the error below says it.
+            warnings.filterwarnings("ignore", ".*render_mode")
+            worlds = [
+                stack.enter_context(closing(envs.make(env, setting, render_mode="rgb_array")))
+                for setting in settings
+            ]
         for world, setting in zip(worlds, settings, strict=True):
             require_observations(policy, world.observation_space, f"{env} {setting}")
         if "rgb_array" not in worlds[0].metadata.get("render_modes", ()):

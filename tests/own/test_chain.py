@@ -85,7 +85,7 @@ def test_the_chain_needs_the_file_only_once(bench):
         file = ("demos.parquet", "--env", "bench/cart.toml")
         own = ("--intervention", "mass=1x", "--setting", "drag=0.5,mass=2x")
         copied = made(bench, "import", *file, *own, "--store", "other", "--quiet")
-        found = read_demonstrations(Store("other").get(copied).directory)
+        found = read_demonstrations(Store("other").resolve(copied).artefact.directory)
         assert found.env == "cart"
         for text, group in recorded.trajectories.items():
             for one, other in zip(group, found.trajectories[text], strict=True):
@@ -228,7 +228,7 @@ def test_planning_and_hits_load_nothing_heavy(bench):
 
 def test_provenance_that_contradicts_the_key_is_refused(bench, publish):
     artefact = made(bench, *IDLE, "--env", "cart.toml")
-    record = Store("runs").get(artefact).manifest.record
+    record = Store("runs").resolve(artefact).artefact.manifest.record
     shutil.rmtree("runs")
     for change in ({"id": "os:Cart-v0"}, {"max_episode_steps": 7}, {"name": "wagon"}, None):
         store = Store("runs")

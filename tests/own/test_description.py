@@ -130,7 +130,7 @@ WRONG = [
     ("[knobs.mass]", "[knobs.1mass]", 2, "'1mass'", "a letter first"),
     ('argument = "mass_scale"', "", 2, "knobs.mass.argument is missing", "[knobs.mass]"),
     ('argument = "mass_scale"', 'argument = "mass-scale"', 2, "'mass-scale'", "constructor"),
-    ('forms = ["multiplier"]', 'forms = ["times"]', 2, "knobs.mass.forms", "own-environments"),
+    ('forms = ["multiplier"]', 'forms = ["times"]', 2, "knobs.mass.forms", "absolute, multiplier"),
     ("low = 0.1", "low = 11.0", 2, "low = 11 is above high = 10", "swap"),
     ("low = 0.1", "low = 0.1\nwhole = true", 2, "knobs.mass: whole = true, but low = 0.1", "whole"),
     ("low = 0.1", "low = nan", 2, "knobs.mass.low", "own-environments"),
