@@ -60,14 +60,14 @@ def bank(
 ) -> dict[Entry, Request]:
     """The entries of a bank in ``settings``, each with the request that records its episodes."""
     found: dict[Entry, Request] = {}
-    for place in settings:
-        for member in _members(str(place), config, policies):
+    for setting in settings:
+        for member in _members(str(setting), config, policies):
             entry = Entry(
-                policy=member.name, kind=member.kind, setting=str(place), ceiling=member.ceiling
+                policy=member.name, kind=member.kind, setting=str(setting), ceiling=member.ceiling
             )
             found[entry] = record.request(
                 env,
-                place,
+                setting,
                 config.evaluation,
                 member.policy,
                 agent="policy" if member.policy is not None else member.kind,  # type: ignore[arg-type]
@@ -78,7 +78,7 @@ def bank(
     return found
 
 
-def _members(place: str, config: Config, policies: Policies) -> Iterator[Member]:
+def _members(setting: str, config: Config, policies: Policies) -> Iterator[Member]:
     yield Member("idle", "idle")
     yield Member("random", "random")
     if policies.clone is not None:
@@ -88,11 +88,11 @@ def _members(place: str, config: Config, policies: Policies) -> Iterator[Member]
         yield Member("student", "student", policies.student)
     for trained, expert in policies.reused.items():
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
-        if trained != place and expert != policies.experts.get(place):
+        if trained != setting and expert != policies.experts.get(setting):
             yield Member(f"expert of {trained}", "reused", expert)
-    if place in policies.experts:
-        yield Member(f"expert of {place}", "expert", policies.experts[place])
-    yield from policies.retrained.get(place, ())
+    if setting in policies.experts:
+        yield Member(f"expert of {setting}", "expert", policies.experts[setting])
+    yield from policies.retrained.get(setting, ())
 
 
 class Finder:
@@ -136,8 +136,8 @@ class Finder:
         """
         env, imitation = origin.env, None
         if demos is not None:
-            places = [parse_setting(env, text) for text in cloned]
-            request = clone.request(demos, env, places, self._config, seed)
+            settings = [parse_setting(env, text) for text in cloned]
+            request = clone.request(demos, env, settings, self._config, seed)
             imitation = From(request, "policy.pt")
         demonstrated = self.demonstrations(reward)
         experts = {}
@@ -187,14 +187,14 @@ class Finder:
         except NotFound:
             return None
 
-    def _retrained(self, reward: Source, place: str) -> list[Member]:
+    def _retrained(self, reward: Source, setting: str) -> list[Member]:
         found = []
         for artefact in self._index.artefacts.values():
             record_ = artefact.manifest.record
             if (
                 record_.stage == "transfer"
                 and record_.inputs.get("reward") == reward.sha256
-                and record_.parameters.get("setting") == place
+                and record_.parameters.get("setting") == setting
             ):
                 name = f"retrained {artefact.id[:8]} {labels.retrained_as(record_)}".strip()
                 policy = source_in(artefact, "policy.pt")

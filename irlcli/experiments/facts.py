@@ -78,11 +78,11 @@ def left_out(
 def _subject(record: KeyRecord) -> _Subject:
     """What an artefact is about. A report never mixes two that differ in anything else."""
     parameters = record.parameters
-    places = parameters.get("settings", parameters.get("setting"))
+    settings = parameters.get("settings", parameters.get("setting"))
     return (
         record.stage,
         labels.environment_of(parameters),
-        tuple(places) if isinstance(places, list | tuple) else places,
+        tuple(settings) if isinstance(settings, list | tuple) else settings,
         _method(parameters),
         parameters.get("agent"),
         parameters.get("noise"),
@@ -94,8 +94,8 @@ def _subject(record: KeyRecord) -> _Subject:
 
 
 def _subject_text(record: KeyRecord) -> str:
-    _, env, places, method, agent, *_ = _subject(record)
-    texts = [places] if isinstance(places, str) else list(places or ())
+    _, env, settings, method, agent, *_ = _subject(record)
+    texts = [settings] if isinstance(settings, str) else list(settings or ())
     return " ".join(str(t) for t in (env, *texts, method, agent) if t and t != "policy")
 
 

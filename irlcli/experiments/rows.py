@@ -133,14 +133,14 @@ class _RowRequests:
     def cell(self, *args: Any, **kwargs: Any) -> Cell:
         return Cell(f"{self.row.env} {self.row.knob}", *args, **kwargs)
 
-    def expert(self, place: Setting) -> Request:
-        if place not in self._experts:
-            self._experts[place] = train_expert.demonstrator(self.row.env, place, self.config)
-        return self._experts[place]
+    def expert(self, setting: Setting) -> Request:
+        if setting not in self._experts:
+            self._experts[setting] = train_expert.demonstrator(self.row.env, setting, self.config)
+        return self._experts[setting]
 
     def returns(
         self,
-        places: Sequence[Setting],
+        settings: Sequence[Setting],
         policy: Request | None,
         agent: Literal["policy", "random", "idle"] = "policy",
         reward: Request | None = None,
@@ -150,7 +150,7 @@ class _RowRequests:
     ) -> Request:
         return evaluate.request(
             self.row.env,
-            places,
+            settings,
             self.config.evaluation,
             None if policy is None else From(policy, "policy.pt"),
             agent,
@@ -160,16 +160,16 @@ class _RowRequests:
             ceiling=ceiling,
         )
 
-    def expert_tasks(self, places: Sequence[Setting]) -> Iterator[Task]:
-        for place in places:
-            yield Task(f"{self.row}.expert.{_value(place)}", "experts", self.expert(place))
+    def expert_tasks(self, settings: Sequence[Setting]) -> Iterator[Task]:
+        for setting in settings:
+            yield Task(f"{self.row}.expert.{_value(setting)}", "experts", self.expert(setting))
 
-    def own_returns(self, place: Setting) -> tuple[str, Request]:
+    def own_returns(self, setting: Setting) -> tuple[str, Request]:
         """Name and request of an expert's returns in its own setting."""
-        only = self.unseen == (place,)
-        name = "expert-returns" if only else f"expert.{_value(place)}.returns"
-        label = f"expert of {place}"
-        request = self.returns([place], self.expert(place), policy_label=label)
+        only = self.unseen == (setting,)
+        name = "expert-returns" if only else f"expert.{_value(setting)}.returns"
+        label = f"expert of {setting}"
+        request = self.returns([setting], self.expert(setting), policy_label=label)
         return f"{self.row}.{name}", request
 
 
@@ -194,8 +194,8 @@ class _Reward(NamedTuple):
     def label(self) -> str:
         return train_airl.reward_label(self.learned.parameters.airl, self.run.seed)
 
-    def cell(self, measure: str, place: str = "", **kwargs: Any) -> Cell:
-        return self.requests.cell(self.run.agent, measure, self.run.seed, place, **kwargs)
+    def cell(self, measure: str, setting: str = "", **kwargs: Any) -> Cell:
+        return self.requests.cell(self.run.agent, measure, self.run.seed, setting, **kwargs)
 
 
 def comparison(
@@ -238,13 +238,13 @@ def comparison(
 def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator[Task]:
     """What the experts, the random and the idle agent earn."""
     row, trained, unseen = requests.row, requests.trained, requests.unseen
-    place = str(unseen[0])
+    setting = str(unseen[0])
     for agent in ("random", "idle"):
-        cell = requests.cell(agent, "ood", place=place)
+        cell = requests.cell(agent, "ood", place=setting)
         request = requests.returns(unseen, None, agent)
         yield Task(f"{row}.{agent}-returns", "returns", request, cell)
     name, request = requests.own_returns(unseen[0])
-    yield Task(name, "returns", request, requests.cell("expert", "ood", place=place))
+    yield Task(name, "returns", request, requests.cell("expert", "ood", place=setting))
     in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
     for e in trained:
         expert, label = requests.expert(e), f"expert of {e}"
@@ -253,10 +253,10 @@ def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator
             yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         reused = (("ood", unseen), ("id", trained)) if expert != requests.expert(unseen[0]) else ()
-        for measure, places in reused:
+        for measure, settings in reused:
             if measure == "ood" or in_distribution:
                 name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
-                request = requests.returns(places, expert, policy_label=label)
+                request = requests.returns(settings, expert, policy_label=label)
                 cell = requests.cell("reused", measure, place=str(e))
                 yield Task(name, "returns", request, cell)
 
@@ -300,16 +300,16 @@ def _run(
     retrained: dict[str, list[Member]] = {}
     for measure in (measure for measure in RETRAINED if measure in measures):
         for retraining in range(retrainings):
-            for place in trained if measure == "transfer-id" else requests.unseen:
-                moved = _retraining(reward, measure, place, retraining)
-                yield from _retrained(reward, moved, measure, place, retraining)
+            for setting in trained if measure == "transfer-id" else requests.unseen:
+                moved = _retraining(reward, measure, setting, retraining)
+                yield from _retrained(reward, moved, measure, setting, retraining)
                 member = Member(
                     _known_as(measure, retraining),
                     "from-student" if measure == "from-student" else "retrained",
                     From(moved, "policy.pt"),
                     ceiling=moved.parameters.transfer.ceiling,
                 )
-                retrained.setdefault(str(place), []).append(member)
+                retrained.setdefault(str(setting), []).append(member)
     if "transfer" in measures:
         yield _expert_by_reward(reward)
     if CUE in measures:
@@ -325,9 +325,9 @@ def _imitation(reward: _Reward, curves: Mapping[str, Request]) -> Iterator[Task]
     """What the policy earns that was trained on the demonstrations: a student, or a clone."""
     requests, run = reward.requests, reward.run
     label = f"{reward.learned.stage.name} {run.agent} of seed {run.seed}"
-    for measure, places in (("zero-shot", requests.unseen), ("id", requests.trained)):
+    for measure, settings in (("zero-shot", requests.unseen), ("id", requests.trained)):
         if measure in reward.measures:
-            request = requests.returns(places, reward.learned, policy_label=label)
+            request = requests.returns(settings, reward.learned, policy_label=label)
             name = f"{run.name}.{measure}-returns"
             yield Task(name, "returns", request, reward.cell(measure), curves)
 
@@ -335,16 +335,16 @@ def _imitation(reward: _Reward, curves: Mapping[str, Request]) -> Iterator[Task]
 def _expert_by_reward(reward: _Reward) -> Task:
     """The learned return of the unseen setting's expert."""
     requests = reward.requests
-    (place,) = requests.unseen
+    (setting,) = requests.unseen
     request = requests.returns(
-        [place],
-        requests.expert(place),
+        [setting],
+        requests.expert(setting),
         reward=reward.learned,
-        policy_label=f"expert of {place}",
+        policy_label=f"expert of {setting}",
         reward_label=reward.label,
-        ceiling=requests.config.transfer_of(place).ceiling,
+        ceiling=requests.config.transfer_of(setting).ceiling,
     )
-    cell = reward.cell(EXPERT_BY_REWARD, str(place))
+    cell = reward.cell(EXPERT_BY_REWARD, str(setting))
     return Task(f"{reward.run.name}.expert-by-reward", "returns", request, cell)
 
 
@@ -355,10 +355,10 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Member]]) -> I
     """
     requests, run = reward.requests, reward.run
     row, trained, unseen = requests.row, requests.trained, requests.unseen
-    places = [*trained, *(unseen if has_held_out(reward.measures) else ())]
+    settings = [*trained, *(unseen if has_held_out(reward.measures) else ())]
     imitation = clone.request(From(reward.demos), row.env, trained, requests.config)
     yield Task(f"{run.shared}.clone", "returns", imitation)
-    experts = {str(e): From(requests.expert(e), "policy.pt") for e in places}
+    experts = {str(e): From(requests.expert(e), "policy.pt") for e in settings}
     policies = Policies(
         clone=From(imitation, "policy.pt"),
         student=From(reward.learned, "policy.pt"),
@@ -366,7 +366,7 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Member]]) -> I
         experts=experts,
         retrained=retrained,
     )
-    members = bank(row.env, places, requests.config, policies)
+    members = bank(row.env, settings, requests.config, policies)
     for entry, recorded in members.items():
         own = entry.kind in ("student", "retrained", "from-student")
         owner = run.name if own else run.shared
@@ -383,13 +383,13 @@ def _known_as(measure: str, retraining: int) -> str:
     return f"{name} {retraining + 1}" if retraining else name
 
 
-def _retraining(reward: _Reward, measure: str, place: Setting, retraining: int) -> Request:
-    """A policy trained on the reward in ``place``."""
+def _retraining(reward: _Reward, measure: str, setting: Setting, retraining: int) -> Request:
+    """A policy trained on the reward in ``setting``."""
     return transfer.request(
         From(reward.learned, "reward.pt"),
         reward.requests.row.env,
-        place,
-        reward.requests.config.transfer_of(place),
+        setting,
+        reward.requests.config.transfer_of(setting),
         reward.run.seed + retraining * _NEXT_RETRAINING,
         reward.label,
         From(reward.learned, "policy.pt") if measure == "from-student" else None,
@@ -397,13 +397,13 @@ def _retraining(reward: _Reward, measure: str, place: Setting, retraining: int) 
 
 
 def _retrained(
-    reward: _Reward, moved: Request, measure: str, place: Setting, retraining: int
+    reward: _Reward, moved: Request, measure: str, setting: Setting, retraining: int
 ) -> Iterator[Task]:
-    """The policy of ``moved``, and what it earns in ``place``, by the reward too."""
+    """The policy of ``moved``, and what it earns in ``setting``, by the reward too."""
     in_distribution = measure == "transfer-id"
-    cell = reward.cell(measure, str(place) if in_distribution else "", retraining=retraining)
+    cell = reward.cell(measure, str(setting) if in_distribution else "", retraining=retraining)
     name = f"{reward.run.name}.{measure}"
-    name += f".{_value(place)}" if in_distribution else ""
+    name += f".{_value(setting)}" if in_distribution else ""
     # No dot: the policy of 0 that is retrained again is not that of 0.1.
     name += f"-{retraining}" if retraining else ""
     yield Task(name, "transfers", moved)
@@ -412,7 +412,7 @@ def _retrained(
         config.algorithm, config.ceiling, measure == "from-student", config.restarts
     )
     request = reward.requests.returns(
-        [place],
+        [setting],
         moved,
         reward=reward.learned,
         policy_label=f"transfer {cell.agent} {how}".strip() + f" of seed {cell.seed}",
@@ -440,18 +440,18 @@ def _choice(name: str, choice: Request) -> Iterator[Task]:
 def experts(row: Row, config_of: ConfigOf) -> Iterator[Task]:
     """The experts of a row's settings, and what they, the random and the idle agent earn there."""
     requests = _RowRequests(row, config_of)
-    for measure, places in (("id", requests.trained), ("ood", requests.unseen)):
-        if not places:
+    for measure, settings in (("id", requests.trained), ("ood", requests.unseen)):
+        if not settings:
             continue
-        yield from requests.expert_tasks(places)
+        yield from requests.expert_tasks(settings)
         for agent in ("random", "idle"):
             name = f"{row}.{agent}{'-id' * (measure == 'id')}-returns"
-            request = requests.returns(places, None, agent)
+            request = requests.returns(settings, None, agent)
             yield Task(name, "returns", request, requests.cell(agent, measure))
-        for place in places:
-            name, request = requests.own_returns(place)
-            cell = requests.cell("expert", measure, place=str(place))
-            yield Task(name, "returns", request, cell, {"learning": requests.expert(place)})
+        for setting in settings:
+            name, request = requests.own_returns(setting)
+            cell = requests.cell("expert", measure, place=str(setting))
+            yield Task(name, "returns", request, cell, {"learning": requests.expert(setting)})
 
 
 def made_by(source: Source | From) -> Request:

@@ -66,12 +66,12 @@ def request(
     Outputs ``assessment.json``, ``bank.parquet`` (a row per episode), ``scatter.png`` and
     ``scatter.svg``.
     """
-    places = list(dict.fromkeys(entry.setting for entry in bank))
-    settings = [parse_setting(env, place) for place in places]
+    texts = list(dict.fromkeys(entry.setting for entry in bank))
+    settings = [parse_setting(env, text) for text in texts]
     parameters = Parameters(environment=environment_key(env, settings), bank=tuple(bank))
     inputs: dict[str, Source | From] = {"reward": reward}
     inputs |= {entry.role: From(recorded) for entry, recorded in bank.items()}
-    label = f"assess {env} {', '.join(places)}"
+    label = f"assess {env} {', '.join(texts)}"
     label += f" by the reward of {reward_label}" if reward_label else ""
     return Request(STAGE, parameters, inputs, label)
 
@@ -187,12 +187,12 @@ def _epic_distances(
             return {}, f"{where.name} names no function of transitions as its true reward"
         return {}, f"the true reward of {where.name} also depends on {what}"
     found = {}
-    for place in dict.fromkeys(entry.setting for entry in episodes):
-        here = {entry.kind: group for entry, group in episodes.items() if entry.setting == place}
+    for setting in dict.fromkeys(entry.setting for entry in episodes):
+        here = {entry.kind: group for entry, group in episodes.items() if entry.setting == setting}
         good = here.get("expert", here.get("student", ()))
         data = transitions([*here["random"], *good], where.max_episode_steps)
-        learned = frozen_reward(where, place, model, origin).g_over_scale
-        found[place] = epic_distance(true, learned, data, origin.network.gamma)
+        learned = frozen_reward(where, setting, model, origin).g_over_scale
+        found[setting] = epic_distance(true, learned, data, origin.network.gamma)
     return found, ""
 
 
