@@ -96,8 +96,8 @@ def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> No
         raise IntegrityError(
             f"{len(names)} of {len(session.store.names())} names point to nothing: "
             f"{', '.join(names)}",
-            "run the command that made the artefact again with the same --name, or give the "
-            "name to another artefact (irl name REF NAME)",
+            "run the command that made the artefact again, with its --name if it had one; or give "
+            "the name to another artefact (irl name REF NAME)",
             result,
         )
 
