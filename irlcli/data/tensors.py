@@ -78,7 +78,7 @@ def from_bytes(data: bytes) -> Any:
     try:
         if not data.startswith(b"PK\x03\x04"):
             # Torch would try its formats from before 2020.
-            raise ValueError("not a zip archive")
+            raise ValueError("torch.save did not write it")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             # torch.save does not compress. Torch would unpack a zip bomb.
             if sum(entry.file_size for entry in archive.infolist()) > len(data):
@@ -94,6 +94,8 @@ def from_bytes(data: bytes) -> Any:
         if function:
             raise RefusedCode(f"it names {function[1][:80]!r}") from None
         raise ValueError("its pickle is malformed") from None
+    except zipfile.BadZipFile:
+        raise ValueError("it is damaged or cut short") from None
     except MemoryError:
         # The machine may be short of memory: that proves nothing about the file.
         raise
