@@ -136,8 +136,8 @@ class Finder:
         """
         env, imitation = origin.env, None
         if demos is not None:
-            settings = [parse_setting(env, text) for text in cloned]
-            request = clone.request(demos, env, settings, self._config, seed)
+            imitated = [parse_setting(env, text) for text in cloned]
+            request = clone.request(demos, env, imitated, self._config, seed)
             imitation = From(request, "policy.pt")
         demonstrated = self.demonstrations(reward)
         experts = {}
