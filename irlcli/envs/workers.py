@@ -123,7 +123,7 @@ class WorkerWorlds:
     """N environments distributed over worker processes, with the interface of ``VectorWorlds``.
 
     Args:
-        factories: one picklable function for each of N >= 1 environments that makes it. All environments have
+        factories: N >= 1 picklable functions, each of which makes one environment. All environments have
             equal observation and action spaces.
         max_episode_steps: time limit after which an episode is truncated.
         workers: number of processes, in [1, N].

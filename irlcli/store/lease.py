@@ -70,10 +70,10 @@ class Patience:
         self._what, self._wait, self._on_wait = what, wait, on_wait
 
     def meet(self, holder: Holder | str) -> None:
-        """Return if the caller is to wait for ``holder``.
+        """Tell of ``holder`` and return, so that the caller waits.
 
         Raises:
-            Busy: it is not.
+            Busy: there is to be no waiting.
         """
         if not self._wait:
             raise Busy(f"{holder} is working on {self._what}", "try again later")
