@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, get_args
 
 import numpy as np
@@ -21,13 +22,20 @@ from irlcli.report.text import number, p_value, percent
 _MAIN_NOTE = (
     "Mean true return ± standard deviation over seeds. p: Welch's test, "
     f"{title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a p-value. "
-    "(3/5): three of five seeds exist; (part): some evaluations are missing. † not imitated in "
-    "distribution. ‡ runs of more than one commit or set of libraries. Training experts, reused: the "
-    "experts of the training settings, each evaluated where the students are, their mean: the return "
-    f"without learning a reward. {PROGRESS} An idle ant earns about 600."
+    "Training experts, reused: the experts of the training settings, each evaluated where the students "
+    "are, their mean: the return without learning a reward."
 )
+# Patterns of cells, and what to say below a table that has such a cell.
+_MARKS = {
+    r"\(\d+/\d+\)": "(3/5): three of five seeds exist.",
+    r"\(part\)": "(part): some evaluations are missing.",
+    "†": "† not imitated in distribution.",
+    "‡": "‡ runs of more than one commit or set of libraries.",
+    "^progress$": PROGRESS,
+    "^ant ": "An idle ant earns about 600.",
+}
 _RETRAININGS_NOTE = (
-    " Each reward was retrained {} times: the return of a seed is their mean, and ± is over seeds. "
+    "Each reward was retrained {} times: the return of a seed is their mean, and ± is over seeds. "
     "*Every cell* has the deviation between retrainings of one reward."
 )
 _SETTING_NOTE = (
@@ -102,18 +110,17 @@ _COST_NOTE = (
 
 
 def measures(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[Table]:
-    """A table per measure, with the note below the first."""
-    several = _RETRAININGS_NOTE.format(p.retrainings) if p.retrainings > 1 else ""
-    notes = [_MAIN_NOTE + several] + [""] * len(p.measures)
-    return [
-        _measure(p, measure, note, cells, comparisons)
-        for measure, note in zip(p.measures, notes, strict=False)
-    ]
+    """A table per measure. The note below the first explains the marks in all of them."""
+    tables = [_measure(p, measure, cells, comparisons) for measure in p.measures]
+    seen = [cell for table in tables for line in table.rows for cell in line]
+    notes = [_MAIN_NOTE]
+    notes += [note for mark, note in _MARKS.items() if any(re.search(mark, cell) for cell in seen)]
+    if p.retrainings > 1:
+        notes.append(_RETRAININGS_NOTE.format(p.retrainings))
+    return [table._replace(note=" ".join(notes)) for table in tables[:1]] + tables[1:]
 
 
-def _measure(
-    p: Parameters, measure: str, note: str, cells: pd.DataFrame, comparisons: pd.DataFrame
-) -> Table:
+def _measure(p: Parameters, measure: str, cells: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """A line per row for its return, and more for progress and for the paper's numbers."""
     in_distribution = measure in IN_DISTRIBUTION
     baseline = "id" if in_distribution else "ood"
@@ -148,7 +155,7 @@ def _measure(
             welch = p_value(_paper_p(printed, equal_variances=False))
             lines.append([where, "paper", *(texts.get(a, "") for a in agents), welch, ""])
     columns = ["setting", "", *(title(a) for a in agents), "p", "Holm"]
-    return Table(MEASURES[measure], note, columns, lines, heads=2)
+    return Table(MEASURES[measure], "", columns, lines, heads=2)
 
 
 def paper_row(p: Parameters, row: Row, measure: str) -> paper.PrintedRow | None:

@@ -50,6 +50,17 @@ def test_a_mean_over_some_of_the_settings_is_marked_beside_the_missing_seeds():
     assert found.startswith("5.0 (1/3) (part)")
 
 
+@pytest.mark.parametrize("mark", ["†", "(part)", "exist", "‡", "Progress", "ant"])
+def test_marks_that_no_cell_has_are_not_explained(mark):
+    assert mark not in build(*example(complete()), {}, {}).tables[0].note
+
+
+def test_marks_of_any_measure_are_explained_below_the_first():
+    values = complete(student=199.0) | {(BOUNCE, "irm", "transfer"): [5.0, None, None]}
+    note = build(*example(values), {}, {}).tables[0].note
+    assert "†" in note and "(3/5)" in note and "‡" not in note
+
+
 def test_learned_returns_stand_side_by_side():
     pairs = {
         (BOUNCE, "erm"): [(4, 1), (5, 1), (9, 10)],
