@@ -9,6 +9,7 @@ from irlcli import labels
 from irlcli.cli import console as out
 from irlcli.cli.options import Ref, store_command
 from irlcli.cli.session import Session
+from irlcli.errors import suggest
 from irlcli.store import Artefact, Index, Store
 
 if TYPE_CHECKING:
@@ -52,8 +53,8 @@ def ls(
     ]
     found.sort(key=lambda item: (item["stage"], item["about"], item["id"]))
     if stage is not None and not found:
-        known = sorted({artefact.manifest.record.stage for artefact in stored})
-        there = f"stored are: {', '.join(known)}" if known else f"{store.root} holds none"
+        known = {artefact.manifest.record.stage for artefact in stored}
+        there = suggest(stage, known) if known else f"{store.root} holds none"
         session.console.warn(f"no artefact is of stage {stage!r}; {there}")
     if session.as_json:
         out.print_json("artefacts", {"artefacts": found, "newer": sorted(index.newer)})

@@ -89,7 +89,10 @@ def _main() -> None:
 
 
 def _interrupted() -> Interrupted:
-    return Interrupted("interrupted", "run the same command again to continue")
+    return Interrupted(
+        "interrupted",
+        "run the same command again: it resumes at the last checkpoint, if there is one",
+    )
 
 
 def _usage(error: Any) -> UsageError:

@@ -15,7 +15,7 @@ from irlcli.report.agents import title
 EvaluationRun = tuple[Evaluation, Mapping[str, Any], bool]
 
 _ORDER = get_args(Agent)
-_HINT = "the runs in a row may differ in their seed only: report the others separately"
+_HINT = "runs in one row may differ only in the seed of the reward learning: report the others separately"
 
 
 class AgentRow(NamedTuple):
@@ -84,7 +84,7 @@ def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
                         "name one evaluation of it",
                     )
                 which = " under the reward of seed ".join(map(str, seeds))
-                raise UsageError(f"{agent} in {item.setting} has seed {which} twice", _HINT)
+                raise UsageError(f"two runs of {agent} in {item.setting} have seed {which}", _HINT)
             first = parameters_of.setdefault(key, parameters)
             for name in sorted({*first, *parameters}):
                 if first.get(name) != parameters.get(name):

@@ -131,10 +131,11 @@ def _of_agent(
     scored: Mapping[str, Any],
 ) -> list[Request]:
     if env is None or not where.given:
-        missing = "--env ENV " if env is None else ""
+        missing = [] if env is not None else ["--env ENV"]
+        missing += [] if where.given else ["--intervention KNOB=VALUE,VALUE or --ood KNOB=VALUE"]
         raise UsageError(
-            f"--{agent} needs the settings to evaluate in",
-            f"add {missing}--intervention KNOB=VALUE,VALUE or --ood KNOB=VALUE",
+            f"--{agent} needs an environment and the settings to evaluate in",
+            f"add {' and '.join(missing)}",
         )
     config = session.config(env, {"evaluation.episodes": episodes})
     settings = where.settings(env, config, scorer)

@@ -86,14 +86,12 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     head = text.partition("/")[0]
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
-    listing = layout.listing
+    listing = f"{layout.listing}, `irl pull NAME --from STORE` copies one from another store"
     close = closest(head, names(layout))
     if close is not None:
         listing = f"did you mean {close!r}? {listing}"
     elif re.fullmatch("[0-9a-f]{1,2}", text):
         listing = f"write at least 3 digits of an id; {listing}"
-    else:
-        listing += ", `irl pull NAME --from STORE` copies one from another store"
     return NotFound(f"{ref!r} names no artefact and no file", listing)
 
 

@@ -162,7 +162,7 @@ class Store:
                 f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
             ) from None
         if before is not None:
-            self.warn(f"{name} no longer names {before}")
+            self.warn(f"{name} no longer names {before}; `irl name {before} {name}` undoes this")
 
     # Working
 

@@ -116,7 +116,7 @@ def test_returns_under_another_reward_are_a_row_of_their_own():
     }
     twice = [by_reward("expert", 1.0, 4) for _ in range(2)]
     with pytest.raises(
-        UsageError, match=r"reward in bounce=0\.9 has seed 0 under the reward of seed 4 twice"
+        UsageError, match=r"reward in bounce=0\.9 have seed 0 under the reward of seed 4"
     ):
         rows(twice)
 
@@ -136,7 +136,7 @@ def test_policies_under_several_rewards_count_once_each():
 def test_a_repeated_seed_is_refused():
     twice = [evaluation("student", x, 3, method="erm") for x in (1.0, 2.0)]
     with pytest.raises(
-        UsageError, match=r"AIRL-ERM student, zero-shot in bounce=0\.9 has seed 3 twice"
+        UsageError, match=r"two runs of AIRL-ERM student, zero-shot in bounce=0\.9 have seed 3"
     ):
         rows(twice)
 
