@@ -64,7 +64,7 @@ class Expected:
                     return index
         raise UsageError(
             f"{place}: setting {text[:80]!r} is not one of {', '.join(self.settings)}",
-            "name every setting of the source by --intervention or --setting",
+            "correct the source, or name every setting of it by --intervention or --setting",
         )
 
     def contradicts(self, name: Any, place: str) -> None:
