@@ -80,6 +80,23 @@ def test_a_value_out_of_range_is_refused_in_plain_words(irl, tmp_path, item, mes
     assert done.code == 2 and done.err.splitlines()[0] == f"error: --set {item}: {message}"
 
 
+def test_an_expert_lacks_only_what_is_not_given(irl, tmp_path):
+    done = irl("evaluate", "--expert", "--ood", "engine-power=1.5x", "--store", tmp_path)
+    assert done.code == 2 and done.err.splitlines()[-1] == "hint: add --env ENV"
+    done = irl("evaluate", "--expert", "--env", "lunar-lander", "--store", tmp_path)
+    assert done.code == 2 and "--env" not in done.err.splitlines()[-1]
+
+
+def test_a_mistyped_name_may_also_be_in_another_store(irl, smoke_store):
+    done = irl("show", "aril", "--store", smoke_store.path)
+    assert done.code == 3 and "did you mean 'airl'?" in done.err and "`irl pull" in done.err
+
+
+def test_a_mistyped_stage_has_a_suggestion(irl, smoke_store):
+    done = irl("ls", "--stage", "tranfer", "--store", smoke_store.path)
+    assert done.code == 0 and "did you mean 'transfer'?" in done.err
+
+
 def test_a_stage_of_an_empty_store(irl, empty_store):
     done = irl("ls", "--stage", "transfer", "--store", empty_store.root)
     assert done.code == 0 and f"'transfer'; {empty_store.root} holds none" in done.err
