@@ -76,6 +76,14 @@ def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
                 agent += f" under {title(reward.method)}'s reward"
                 seeds.append(reward.seed)
             key = (order, agent, policy.env, item.setting)
+            first = parameters_of.setdefault(key, parameters)
+            for name in sorted({*first, *parameters}):
+                if first.get(name) != parameters.get(name):
+                    raise UsageError(
+                        f"runs of {agent} in {item.setting} differ in {name}: "
+                        f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
+                        _HINT,
+                    )
             if tuple(seeds) in groups.get(key, {}):
                 if seeds == [None]:
                     raise UsageError(
@@ -85,14 +93,6 @@ def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
                     )
                 which = " under the reward of seed ".join(map(str, seeds))
                 raise UsageError(f"two runs of {agent} in {item.setting} have seed {which}", _HINT)
-            first = parameters_of.setdefault(key, parameters)
-            for name in sorted({*first, *parameters}):
-                if first.get(name) != parameters.get(name):
-                    raise UsageError(
-                        f"runs of {agent} in {item.setting} differ in {name}: "
-                        f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
-                        _HINT,
-                    )
             values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
             groups.setdefault(key, {})[tuple(seeds)] = values
     found = []
