@@ -8,6 +8,7 @@ quarantine, never deleted. The layout is described in :mod:`irlcli.store.layout`
 from __future__ import annotations
 
 import os
+import shlex
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -162,7 +163,8 @@ class Store:
                 f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
             ) from None
         if before is not None:
-            self.warn(f"{name} no longer names {before}; `irl name {before} {name}` undoes this")
+            undo = shlex.join(["irl", "name", before, name, *self.option])
+            self.warn(f"{name} no longer names {before}; `{undo}` undoes this")
 
     # Working
 
