@@ -147,7 +147,7 @@ def _check(session: Session, spec: EnvironmentSpec, config: Config) -> None:
     if failed:
         raise StageFailed(
             f"{len(failed)} of {len(outcomes)} checks of {spec.name} failed: "
-            f"{failed[0].what}: {failed[0].wrong}",
+            f"{'; '.join(found.what for found in failed)}",
             "docs/own-environments.md and docs/extending.md say what is expected",
             {"checks": _as_json(outcomes)},
         )

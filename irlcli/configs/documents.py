@@ -42,8 +42,10 @@ def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
             raise ValueError(f"it is larger than {_MAX_TOML_BYTES >> 10} KiB")
         return parse_toml(path.read_text("utf-8"))
     except (ValueError, RecursionError) as error:
+        syntax = isinstance(error, tomllib.TOMLDecodeError)
+        quotes = 'text is written in quotes: "0.5x"; ' if syntax else ""
         raise UsageError(
-            f"{path} is not valid TOML: {error}", "see settings/ for examples"
+            f"{path} is not valid TOML: {error}", f"{quotes}see settings/ for examples"
         ) from None
     except OSError as error:
         raise UsageError(

@@ -37,7 +37,10 @@ class _Wrong(Exception):
 
 
 def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Iterator[Found]:
-    """Every check of ``spec``, in order. If the environment cannot be made, the others are skipped.
+    """Every check of ``spec``, in order.
+
+    If the environment cannot be made, the others are skipped; if a knob's bounds cannot be made, the
+    others of this knob are.
 
     Args:
         spec: a known environment.
@@ -53,7 +56,10 @@ def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Ite
         yield _outcome("its symmetries", partial(_check_symmetries, spec))
     for name, knob in spec.knobs.items():
         ends = [Setting(((name, value),)) for value in _ends(knob)]
-        yield _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))
+        bounds = _outcome(f"{name}: its bounds can be made", partial(_check_ends, spec, ends))
+        yield bounds
+        if bounds.wrong:
+            continue
         if "multiplier" in knob.forms and knob.low <= 1 <= knob.high:
             yield _outcome(f"{name}: 1x is the default", partial(_check_one, spec, name))
         settings = [Setting(), *listed.get(name, ()), *ends]

@@ -2,11 +2,12 @@
 
 # math instead of statistics: a cache hit prints returns, and statistics is slow to import.
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, get_args
 
 from irlcli import labels
-from irlcli.data.descriptions import Agent, Evaluation, Subject
+from irlcli.data.descriptions import Agent, Evaluation, Returns, Subject
 from irlcli.errors import UsageError
 from irlcli.interventions import covers, parse_setting
 from irlcli.report.agents import title
@@ -14,8 +15,11 @@ from irlcli.report.agents import title
 # A summary, the parameters behind it that seeds share, and whether its reward is the policy's own.
 EvaluationRun = tuple[Evaluation, Mapping[str, Any], bool]
 
+# Order of the agent, agent, environment, setting.
+_Group = tuple[int, str, str, str]
 _ORDER = get_args(Agent)
-_HINT = "runs in one row may differ only in the seed of the reward learning: report the others separately"
+_MOST_DIFFERENCES = 3
+_SHA256 = re.compile("[0-9a-f]{64}")
 
 
 class AgentRow(NamedTuple):
@@ -51,21 +55,30 @@ class AgentRow(NamedTuple):
         return math.sqrt(squares / (len(self.returns) - 1))
 
 
+class _Run(NamedTuple):
+    """An evaluation in one setting: seed of the policy (and of a reward not its own), and what was measured."""
+
+    seeds: tuple[int | None, ...]
+    measured: Returns
+    parameters: Mapping[str, Any]
+
+
 def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
     """A row per agent, method and setting: experts first, random and idle last.
 
     An agent that was scored by another reward than its own has a row for each method of such
-    rewards. Its seeds are then pairs: the policy's and the reward's.
+    rewards. Its seeds are then pairs: the policy's and the reward's. Runs that differ in one of up
+    to three parameters besides the seed have a row for each of its values, which the agent's name
+    tells.
 
     Args:
-        evaluations: ``summary.json``, the parameters behind it that must not differ between seeds,
-            and whether the reward that scored the policy is the policy's own.
+        evaluations: ``summary.json``, the parameters behind it that seeds share, and whether the
+            reward that scored the policy is the policy's own.
 
     Raises:
-        UsageError: a row has the same seed twice, or seeds that differ in one of those parameters.
+        UsageError: a row has the same seed twice, or runs of an agent differ in more parameters.
     """
-    parameters_of: dict[tuple[int, str, str, str], Mapping[str, Any]] = {}
-    groups: dict[tuple[int, str, str, str], dict[tuple, tuple]] = {}
+    groups: dict[_Group, list[_Run]] = {}
     for summary, parameters, own in evaluations:
         policy, reward = summary.policy, summary.reward
         order = _ORDER.index(policy.agent)
@@ -75,37 +88,70 @@ def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
             if reward is not None and not own:
                 agent += f" under {title(reward.method)}'s reward"
                 seeds.append(reward.seed)
-            key = (order, agent, policy.env, item.setting)
-            first = parameters_of.setdefault(key, parameters)
-            for name in sorted({*first, *parameters}):
-                if first.get(name) != parameters.get(name):
-                    raise UsageError(
-                        f"runs of {agent} in {item.setting} differ in {name}: "
-                        f"{first.get(name, 'unset')} and {parameters.get(name, 'unset')}",
-                        _HINT,
-                    )
-            if tuple(seeds) in groups.get(key, {}):
-                if seeds == [None]:
-                    raise UsageError(
-                        f"{agent} in {item.setting} appears twice: it is one agent, whatever the "
-                        "seed of its episodes",
-                        "name one evaluation of it",
-                    )
-                which = " under the reward of seed ".join(map(str, seeds))
-                raise UsageError(f"two runs of {agent} in {item.setting} have seed {which}", _HINT)
-            values = item.mean_return, item.episodes, item.mean_progress, item.mean_learned_return
-            groups.setdefault(key, {})[tuple(seeds)] = values
-    found = []
-    for (_, agent, env, setting), items in sorted(groups.items()):
-        _, episodes, progress, learned = zip(*items.values(), strict=True)
-        policies: dict[Any, list[float]] = {}
-        for (seed, *_), (true_return, *_) in items.items():
-            policies.setdefault(seed, []).append(true_return)
-        returns = tuple(math.fsum(each) / len(each) for each in policies.values())
-        found.append(
-            AgentRow(agent, env, setting, returns, min(episodes), _mean(progress), _mean(learned))
+            group = (order, agent, policy.env, item.setting)
+            groups.setdefault(group, []).append(_Run(tuple(seeds), item, parameters))
+    return [
+        _row(f"{agent}{how}", env, setting, runs)
+        for (_, agent, env, setting), group in sorted(groups.items(), key=lambda item: item[0])
+        for how, runs in _by_parameters(agent, setting, group).items()
+    ]
+
+
+def _by_parameters(agent: str, setting: str, runs: Sequence[_Run]) -> dict[str, list[_Run]]:
+    """Runs of equal parameters, by the parameters that tell them from the other runs."""
+    names = sorted({name for run in runs for name in run.parameters})
+    differing = [n for n in names if any(_value(run, n) != _value(runs[0], n) for run in runs)]
+    if len(differing) > _MOST_DIFFERENCES:
+        listed = ", ".join(differing[:_MOST_DIFFERENCES])
+        raise UsageError(
+            f"runs of {agent} in {setting} differ in {len(differing)} parameters: {listed}, ...",
+            f"at most {_MOST_DIFFERENCES} can tell rows apart: report the others separately",
         )
+    found: dict[str, list[_Run]] = {}
+    for run in runs:
+        how = "".join(f", {_field(name)} {_value(run, name)}" for name in differing)
+        found.setdefault(how, []).append(run)
     return found
+
+
+def _value(run: _Run, name: str) -> str:
+    text = str(run.parameters.get(name, "unset")).removesuffix(".0")
+    return text[:12] if _SHA256.fullmatch(text) else text
+
+
+def _field(name: str) -> str:
+    """``train-airl.airl.penalty_weight`` as ``--set`` names it: ``airl.penalty_weight``."""
+    return name.partition(".")[2] if name.count(".") > 1 else name
+
+
+def _row(agent: str, env: str, setting: str, runs: Sequence[_Run]) -> AgentRow:
+    by_seeds: dict[tuple[int | None, ...], Returns] = {}
+    for seeds, item, _ in runs:
+        if seeds in by_seeds and seeds == (None,):
+            raise UsageError(
+                f"{agent} in {setting} appears twice: it is one agent, whatever the seed of its "
+                "episodes",
+                "name one evaluation of it",
+            )
+        if seeds in by_seeds:
+            which = " under the reward of seed ".join(map(str, seeds))
+            raise UsageError(
+                f"two runs of {agent} in {setting} have seed {which}", "name one of them"
+            )
+        by_seeds[seeds] = item
+    policies: dict[int | None, list[float]] = {}
+    for (seed, *_), item in by_seeds.items():
+        policies.setdefault(seed, []).append(item.mean_return)
+    measured = by_seeds.values()
+    return AgentRow(
+        agent,
+        env,
+        setting,
+        returns=tuple(math.fsum(each) / len(each) for each in policies.values()),
+        episodes=min(item.episodes for item in measured),
+        progress=_mean([item.mean_progress for item in measured]),
+        learned=_mean([item.mean_learned_return for item in measured]),
+    )
 
 
 def as_json(evaluations: Iterable[EvaluationRun]) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ from irlcli.interventions import (
 )
 
 if TYPE_CHECKING:
-    from irlcli.configs import Config
+    from irlcli.configs import AIRLConfig, Config, MaxEntConfig
     from irlcli.data.descriptions import Policy, Reward
     from irlcli.experiments.runner import RunConsole
     from irlcli.stages.base import Source
@@ -355,6 +355,12 @@ def check_weighted(
             f"--penalty-weight {penalty_weight:g}: {name} has no penalty",
             f"omit --penalty-weight; methods with a penalty: {', '.join(penalised)}",
         )
+
+
+def warn_of_weight(console: "RunConsole", name: str, config: "AIRLConfig | MaxEntConfig") -> None:
+    """Warn if lambda is 0, which turns off the penalty that ``name`` is called after."""
+    if config.penalty != "none" and config.penalty_weight == 0:
+        console.warn(f"lambda is 0: {name} learns without its penalty, {config.penalty}")
 
 
 def check_cloning(method: str, options: Mapping[str, Any]) -> None:

@@ -66,6 +66,7 @@ def train_airl(
     config = session.config(env, flags)
     airl = config.airl_of(settings)
     arguments.check_weighted(airl_stage.name(airl), METHODS, airl.penalty, penalty_weight)
+    arguments.warn_of_weight(session.console, airl_stage.name(airl), airl)
     basis: dict[str, Source] = {}
     if choose_penalty is not None:
         # A bad option must fail before the choice of lambda, which takes long.
@@ -128,6 +129,7 @@ def train_maxent(
     maxent = config.maxent
     name = f"{maxent.grouping} MaxEnt"
     arguments.check_weighted(name, maxent_methods(), maxent.penalty, penalty_weight)
+    arguments.warn_of_weight(session.console, name, maxent)
     settings = [parse_setting(env, text) for text in texts]
     unseen = unseen_settings(env, config)
     return maxent_stage.request(source, env, settings, unseen, maxent, seed)

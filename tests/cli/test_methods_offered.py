@@ -52,6 +52,14 @@ def test_behavioural_cloning_takes_no_option_about_a_reward(irl, store_copy, opt
     assert done.code == 2 and f"--method bc takes no {option}" in done.err
 
 
+def test_a_penalty_that_lambda_turns_off_is_named(irl, smoke_store):
+    line = ["train-airl", "--demos", "demos", "--method", "irm", "--profile", "smoke", "--dry-run"]
+    for weight, warned in (("0", True), ("1", False)):
+        done = irl(*line, "--penalty-weight", weight, "--store", smoke_store.path)
+        assert done.code == 0
+        assert ("lambda is 0: irm learns without its penalty" in done.err) == warned
+
+
 def test_gail_leaves_a_reward_that_transfers(irl, store_copy):
     path = store_copy.path
     learned = made(irl, path, "train-airl", "--demos", "demos", "--method", "gail")

@@ -146,6 +146,7 @@ WRONG = [
     ("[profiles.smoke.airl]", "[profiles.quick.airl]", 2, "profiles.quick", "smoke"),
     ("total_steps = 80_000", "total_steps = 0", 2, "total_steps", "for example"),
     ("low = 0.1", "low = ", 2, "is not valid TOML", "settings/"),
+    ("low = 0.1", "low = 0.1x", 2, "is not valid TOML", "quotes"),
 ]
 
 

@@ -317,7 +317,12 @@ def test_the_example_passes_every_check(bench):
             "drag: its bounds can be made",
             "too much",
         ),
-        ("mass_scale=1.0", "mass_scale_=1.0", "mass: its bounds can be made", "mass_scale"),
+        (
+            "mass_scale=1.0",
+            "mass_scale_=1.0",
+            "mass: its bounds can be made",
+            "mass_scale=0.1 (knobs.mass.argument)",
+        ),
         ("self.drag = drag", "raise ValueError('\\nbroken')", "it can be made", "broken"),
         (
             "self.position = self",
@@ -344,6 +349,10 @@ def test_checks_find_what_is_wrong(bench, old, new, failed, named):
     lines = done.out.splitlines()
     assert done.code == 1 and "checks of cart failed" in done.err
     assert named in lines[lines.index(f"FAIL  {failed}") + 1]
+    assert failed in done.err and lines[-1] not in done.err
+    if failed.endswith("its bounds can be made"):
+        # The knob's other checks would fail alike.
+        assert sum(failed.partition(":")[0] in line for line in lines if line[:4] == "FAIL") == 1
 
 
 @pytest.mark.parametrize(

@@ -141,12 +141,37 @@ def test_a_repeated_seed_is_refused():
         rows(twice)
 
 
-def test_seeds_that_differ_in_more_than_the_seed_are_refused():
-    made = [{"train-airl.airl.penalty_weight": weight, "evaluate.env": "x"} for weight in (1, 100)]
+def test_runs_that_differ_in_a_parameter_are_rows_that_name_it():
+    weight = "train-airl.airl.penalty_weight"
+    runs = [
+        evaluation("student", mean, seed, {weight: w, "evaluate.env": "x"}, method="irm")
+        for mean, seed, w in ((1.0, 0, 1.0), (3.0, 1, 1.0), (8.0, 0, 100.0))
+    ]
+    alone = "AIRL-IRM student, zero-shot"
+    assert [(row.agent, row.returns) for row in rows(runs)] == [
+        (f"{alone}, airl.penalty_weight 1", (1.0, 3.0)),
+        (f"{alone}, airl.penalty_weight 100", (8.0,)),
+    ]
+    assert [row.agent for row in rows(runs[:2])] == [alone]
+
+
+def test_a_parameter_that_some_runs_do_not_have_tells_them_apart():
+    runs = [
+        evaluation("student", 1.0, 0, made, method="irm")
+        for made in ({"train-airl.demonstrations": "0" * 64}, {})
+    ]
+    found = [row.agent.partition("zero-shot")[2] for row in rows(runs)]
+    assert found == [
+        ", train-airl.demonstrations 000000000000",
+        ", train-airl.demonstrations unset",
+    ]
+
+
+def test_runs_that_share_too_little_are_refused():
+    made = [{f"train-airl.airl.field_{i}": value for i in range(4)} for value in (1, 2)]
     students = [evaluation("student", 1.0, k, m, method="irm") for k, m in enumerate(made)]
-    with pytest.raises(UsageError, match=r"differ in train-airl\.airl\.penalty_weight: 1 and 100"):
+    with pytest.raises(UsageError, match=r"differ in 4 parameters: train-airl\.airl\.field_0, "):
         rows(students)
-    assert len(rows(students[:1])) == 1
 
 
 def test_an_agent_without_a_seed_is_one_agent():
