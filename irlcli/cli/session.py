@@ -150,7 +150,7 @@ class StageSession(base.StageSession):
         Returns:
             the artefacts; none with ``--dry-run``.
         """
-        self.warn_of_unread(requests)
+        self.warn_before(requests)
         if self.dry_run:
             if name is not None:
                 self.store.check_name(name)

@@ -292,7 +292,7 @@ class Lab:
         options["episodes"] = None if episodes is None else whole("episodes", episodes, 1)
         with self._at_work(configs, words("evaluate", options)) as session:
             requests = evaluation.evaluate(session, **options, name=name)
-            session.warn_of_unread(requests)
+            session.warn_before(requests)
             return Evaluations([Stored(session, a) for a in session.run(requests, name)])
 
     @plainly
@@ -406,7 +406,7 @@ class Lab:
             yield session
 
     def _run(self, session: StageSession, request: Request, name: str | None) -> Stored:
-        session.warn_of_unread([request])
+        session.warn_before([request])
         return Stored(session, session.run([request], name)[0])
 
     def _options(self, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from irlcli.errors import NotFound, UsageError
 from irlcli.store import DEFAULT_ROOT, Artefact, Store
 
 DEFAULT_STORE, DEFAULT_PROFILE = Path(DEFAULT_ROOT), "standard"
+_SMOKE = "smoke"
 
 if TYPE_CHECKING:
     from irlcli.configs import Config
@@ -235,11 +237,35 @@ class StageSession(Session):
         for item in () if whole else unread(self.asked, every):
             self._warn_once(f"no {reader} reads --set {item}")
 
+    def warn_before(self, requests: Sequence["Request"]) -> None:
+        """Warn of what is likely a mistake in one command's ``requests``."""
+        self.warn_of_unread(requests)
+        self._warn_of_smoke(requests)
+
+    def _warn_of_smoke(self, requests: Sequence["Request"]) -> None:
+        """Warn of inputs from the profile ``smoke``, which learns nothing, under another profile."""
+        if self.profile == _SMOKE:
+            return
+        for request in requests:
+            for source in request.inputs.values():
+                # An input that another request makes has the session's profile.
+                artefact = getattr(source, "artefact", None)
+                if artefact is not None and _is_smoke(artefact.provenance()):
+                    self._warn_once(
+                        f"{artefact.manifest.record.stage} {artefact.id} was made with --profile "
+                        f"{_SMOKE}, this command uses {self.profile}"
+                    )
+
     def _warn_once(self, message: str) -> None:
         # A figure's report needs the steps of its table, which were looked at before.
         if message not in self._warned:
             self._warned.add(message)
             self.console.warn(message)
+
+
+def _is_smoke(provenance: Mapping[str, Any]) -> bool:
+    command = list(provenance.get("command") or ())
+    return f"--profile={_SMOKE}" in command or ["--profile", _SMOKE] in map(list, pairwise(command))
 
 
 def _check_repeated(overrides: Sequence[str]) -> None:

@@ -478,3 +478,10 @@ def test_an_expert_is_compared_with_the_bar_of_its_knob(
     line = "collect-experts --env lunar-lander --intervention engine-power=1x,1.25x --settings"
     done = irl(*line.split(), file, *SMOKE, "--store", smoke_store.path)
     assert done.code == 0 and done.err.count("bar 10000") == below
+
+
+@pytest.mark.parametrize("line", ["transfer --reward airl --ood 1.5x", "train-airl --demos demos"])
+def test_inputs_from_the_smoke_profile_are_named(irl, smoke_store, line):
+    words = [*line.split(), "--dry-run", "--store", smoke_store.path]
+    assert "was made with --profile smoke" in irl(*words).err
+    assert "was made with" not in irl(*words, *SMOKE).err
