@@ -145,7 +145,8 @@ def load_reward(
     from irlcli.errors import UsageError
     from irlcli.experiments.references import tensor_file
     from irlcli.experiments.status import checked
-    from irlcli.stages.base import environment_key, frozen_reward
+    from irlcli.stages.base import environment_key
+    from irlcli.stages.running import frozen_reward
 
     if gamma is not None and not 0.0 <= gamma < 1.0:
         raise UsageError(

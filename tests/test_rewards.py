@@ -102,7 +102,8 @@ def test_it_is_g_by_scale_with_ceiling_and_absorbing_states(tmp_path, env, absor
 def test_it_is_what_transfer_trains_on(tmp_path, env):
     """The reward of a rollout's steps, absorbing states included."""
     from irlcli.data.tensors import load_reward_file
-    from irlcli.stages.base import environment_key, frozen_reward
+    from irlcli.stages.base import environment_key
+    from irlcli.stages.running import frozen_reward
     from irlcli.trajectories import Rollout
 
     path, _ = write_random_reward(tmp_path, env, fixed_horizon=True)

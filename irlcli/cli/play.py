@@ -96,7 +96,8 @@ def _rewards(
 ) -> "list[FrozenReward]":
     """The reward in each of ``settings``."""
     from irlcli.data.tensors import load_reward_file
-    from irlcli.stages.base import environment_key, frozen_reward
+    from irlcli.stages.base import environment_key
+    from irlcli.stages.running import frozen_reward
 
     model, origin = load_reward_file(checked(session.store, source))
     where = environment_key(env, settings)

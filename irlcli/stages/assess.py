@@ -12,16 +12,8 @@ import msgspec
 
 from irlcli.envs.registry import environment
 from irlcli.interventions import parse_setting
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    frozen_reward,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import frozen_reward
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,15 +10,7 @@ from irlcli.errors import UsageError
 from irlcli.interventions import Setting
 from irlcli.penalties import PENALTIES
 from irlcli.stages import evaluate, train_airl
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):

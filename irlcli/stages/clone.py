@@ -10,15 +10,7 @@ from irlcli.configs.relevance import check_actions, relevant_ppo
 from irlcli.configs.schema import CloneConfig
 from irlcli.envs.registry import environment
 from irlcli.interventions import Setting, check_tabular, parse_setting
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
 
 
 class Network(msgspec.Struct, frozen=True, kw_only=True):

@@ -13,17 +13,8 @@ from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_observed, parse_setting, without_cue
 from irlcli.stages import train_expert
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    shown,
-    summary_of,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import shown, summary_of
 
 if TYPE_CHECKING:
     from irlcli.rl.policy import Policy

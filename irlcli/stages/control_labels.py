@@ -11,7 +11,8 @@ from irlcli.configs import CuedLabelsConfig
 from irlcli.controls.variants import Method
 from irlcli.errors import UsageError
 from irlcli.penalties import PENALTIES
-from irlcli.stages.base import Job, Request, Stage, run_parts
+from irlcli.stages.base import Job, Request, Stage
+from irlcli.stages.running import run_parts
 
 DIGITS = "coloured digits"
 PROBLEMS = (DIGITS, "example 2", "example 3")

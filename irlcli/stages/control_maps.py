@@ -12,7 +12,8 @@ from irlcli.configs import CuedMapsConfig
 from irlcli.controls.variants import Variant
 from irlcli.errors import UsageError
 from irlcli.penalties import PENALTIES
-from irlcli.stages.base import Job, Request, Stage, run_parts
+from irlcli.stages.base import Job, Request, Stage
+from irlcli.stages.running import run_parts
 
 _DEFAULT = CuedMapsConfig()
 

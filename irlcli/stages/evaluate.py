@@ -9,18 +9,8 @@ import msgspec
 
 from irlcli.configs import EvaluationConfig
 from irlcli.interventions import Setting, check_tabular, parse_setting
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    frozen_reward,
-    shown,
-    summary_of,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import frozen_reward, shown, summary_of
 
 if TYPE_CHECKING:
     from irlcli.rl.policy import Policy

@@ -11,15 +11,8 @@ import msgspec
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, parse_setting
-from irlcli.stages.base import (
-    EnvironmentKey,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    means_of,
-)
+from irlcli.stages.base import EnvironmentKey, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import means_of
 
 if TYPE_CHECKING:
     from irlcli.data.exchange.expected import Expected

@@ -6,16 +6,8 @@ import msgspec
 
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, cue_in
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    frozen_reward,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import frozen_reward
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):

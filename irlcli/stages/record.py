@@ -12,17 +12,8 @@ import msgspec
 from irlcli.configs import EvaluationConfig
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.stages import evaluate
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    shown,
-    summary_of,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import shown, summary_of
 
 if TYPE_CHECKING:
     from irlcli.rl.policy import Policy

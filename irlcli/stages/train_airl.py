@@ -18,17 +18,8 @@ from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    run_training,
-    warn_of_labels,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import run_training, warn_of_labels
 
 if TYPE_CHECKING:
     from irlcli.learners.airl import AIRL

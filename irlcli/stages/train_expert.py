@@ -8,14 +8,8 @@ from irlcli.configs import Config, ExpertConfig, PPOConfig
 from irlcli.configs.relevance import relevant_ppo
 from irlcli.envs.registry import environment
 from irlcli.interventions import Setting, check_tabular, parse_setting, without_cue
-from irlcli.stages.base import (
-    EnvironmentKey,
-    Job,
-    Request,
-    Stage,
-    environment_key,
-    run_training,
-)
+from irlcli.stages.base import EnvironmentKey, Job, Request, Stage, environment_key
+from irlcli.stages.running import run_training
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):

@@ -15,16 +15,8 @@ from irlcli.errors import IntegrityError
 from irlcli.interventions import Setting, check_tabular
 from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    warn_of_labels,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import warn_of_labels
 
 if TYPE_CHECKING:
     import numpy as np

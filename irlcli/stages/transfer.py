@@ -16,17 +16,8 @@ from irlcli.configs.relevance import relevant_transfer
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
-from irlcli.stages.base import (
-    EnvironmentKey,
-    From,
-    Job,
-    Request,
-    Source,
-    Stage,
-    environment_key,
-    frozen_reward,
-    run_training,
-)
+from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
+from irlcli.stages.running import frozen_reward, run_training
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,7 +14,8 @@ from irlcli.interventions import parse_setting
 from irlcli.report import animation
 from irlcli.rl.rollout import roll_out
 from irlcli.seeds import derive
-from irlcli.stages.base import environment_key, frozen_reward
+from irlcli.stages.base import environment_key
+from irlcli.stages.running import frozen_reward
 from irlcli.store import Store
 
 

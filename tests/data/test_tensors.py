@@ -16,7 +16,8 @@ from irlcli.data.tensors import (
 )
 from irlcli.errors import IntegrityError, NewerFormat, StageFailed, UsageError
 from irlcli.experiments.runner import Silent
-from irlcli.stages.base import Job, run_training
+from irlcli.stages.base import Job
+from irlcli.stages.running import run_training
 
 LOADERS = {"reward": load_reward_file, "policy": load_policy_file}
 

@@ -17,7 +17,8 @@ from irlcli.learners.frozen import FrozenReward
 from irlcli.requests.arguments import warn_of_seen
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.sac import SACTrainer
-from irlcli.stages.base import environment_key, frozen_reward
+from irlcli.stages.base import environment_key
+from irlcli.stages.running import frozen_reward
 from irlcli.store import Store
 
 
