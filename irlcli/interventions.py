@@ -247,7 +247,7 @@ def listed_settings(env: str, knob: str, values: Sequence[str]) -> tuple[Setting
 
 
 def check_distinct(where: str, settings: Sequence[Setting]) -> None:
-    """Refuse settings that name the same world, as ``default`` and ``mass=1x`` do.
+    """Refuse settings that change the same knobs to the same values, as ``default`` and ``mass=1x`` do.
 
     Only the environment knows whether an absolute value is the default: ``bounce=0`` and
     ``default`` are accepted.
@@ -258,7 +258,7 @@ def check_distinct(where: str, settings: Sequence[Setting]) -> None:
     for i, setting in enumerate(settings):
         for other in settings[:i]:
             # HalfCheetah's leg-length=1 is leg-length=1x, but not known to be the default.
-            if world(setting) == world(other) or _named(setting) == _named(other):
+            if changed(setting) == changed(other) or _named(setting) == _named(other):
                 again = f", once as {setting}" if setting != other else ""
                 raise UsageError(
                     f"{where} names {other} twice{again}",
@@ -266,7 +266,7 @@ def check_distinct(where: str, settings: Sequence[Setting]) -> None:
                 )
 
 
-def world(setting: Setting) -> dict[str, tuple[float, ...]]:
+def changed(setting: Setting) -> dict[str, tuple[float, ...]]:
     """The numbers of each knob that a setting changes, equal for 10 and 10..10."""
     return _named(_effective(setting))
 
@@ -287,7 +287,7 @@ def _numbers(value: Value) -> tuple[float, ...]:
 
 
 def covers(wide: Setting, narrow: Setting) -> bool:
-    """Whether every world of ``narrow`` is one of ``wide``, as -5 and -5..0 are of -10..0."""
+    """Whether ``narrow`` only has knob values of ``wide``, as -5 and -5..0 are of -10..0."""
     wide, narrow = _effective(wide), _effective(narrow)
     return wide.knobs == narrow.knobs and all(
         _covers(value, other)
@@ -303,7 +303,7 @@ def _covers(wide: Value, narrow: Value) -> bool:
 
 
 def overlap(one: Setting, other: Setting) -> bool:
-    """Whether two settings share worlds: for each knob one covers the other, or ranges overlap."""
+    """Whether two settings share knob values: for each knob one covers the other, or ranges overlap."""
     one, other = _effective(one), _effective(other)
     return one.knobs == other.knobs and all(
         _overlap(value, another)
@@ -381,7 +381,7 @@ def cue_in(env: str, setting: Setting) -> tuple[Cue, float] | None:
 
 
 def without_cue(env: str, setting: Setting) -> Setting:
-    """The world that the cue of ``setting`` is added to; itself if it has none."""
+    """``setting`` without its cue; itself if it has none."""
     found = cue_in(env, setting)
     if found is None:
         return setting

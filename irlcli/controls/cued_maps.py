@@ -1,4 +1,4 @@
-"""A tabular world in which invariance must help: maps of cells that look better than they are.
+"""A tabular MDP in which invariance must help: maps of cells that look better than they are.
 
 The true reward is a cell's *quality*. The learner does not see it. It sees a *texture*, which agrees
 with the quality equally often in every setting, and *colours*, which agree with it more often, but
@@ -84,7 +84,7 @@ def hint_weights(reward: np.ndarray) -> np.ndarray:
 
 
 def torus(size: int, settings: int) -> StackedMDPs:
-    """``settings`` equal worlds of ``size`` x ``size`` cells: stay, or move to one of four cells.
+    """``settings`` equal MDPs of ``size`` x ``size`` cells: stay, or move to one of four cells.
 
     The first state is uniform. Rewards are those of the maps; there is no goal, and cell 0, which
     the MDP must name as one, is a cell like any other.

@@ -182,7 +182,7 @@ class MaxEnt:
         hidden: width of the hidden layer; 0 learns psi of r = psi^T features.
         learning_rate: of RMSProp.
         kinds: [R, E, S], the kind of each state, where the settings look different or runs have
-            different worlds; None: every state is a kind of its own, the same in every setting
+            different MDPs; None: every state is a kind of its own, the same in every setting
             (T = S).
         penalty_warmup: iterations at lambda = 0. After them the whole objective is divided by
             :func:`irlcli.penalties.loss_divisor`, as the discriminator's is: RMSProp has then adapted

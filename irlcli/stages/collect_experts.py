@@ -163,7 +163,7 @@ def _expert(job: Job, text: str) -> Policy:
         return load_policy_file(path)[0]
     beside = job.inputs.get(f"{_NORMALISER} {text}")
     saved, *statistics = (File(str(f), f.read_bytes()) for f in (path, beside) if f)
-    # It acts in the world without a cue, as every expert does.
+    # It acts in the setting without a cue, as every expert does.
     return load_saved(saved, env, without_cue(env, parse_setting(env, text)), *statistics)
 
 

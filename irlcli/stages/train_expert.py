@@ -40,7 +40,7 @@ def request(env: str, setting: Setting, seed: int, expert: ExpertConfig) -> Requ
 
 
 def demonstrator(env: str, setting: Setting, config: Config) -> Request:
-    """The expert that demonstrates in ``setting``: that of the same world without a cue.
+    """The expert that demonstrates in ``setting``: that of the same setting without a cue.
 
     Raises:
         UsageError: as :func:`request`.

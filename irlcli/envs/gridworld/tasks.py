@@ -68,11 +68,11 @@ def sample(
     Raises:
         UsageError: as :func:`mdp`.
     """
-    world = mdp(text, grid)
+    problem = mdp(text, grid)
     with usable_input():
-        policy = gridworld.expert_policy(world, grid.horizon)
+        policy = gridworld.expert_policy(problem, grid.horizon)
     seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
-    return gridworld.sample_trajectories(world, grid.size, policy, episodes, seed)
+    return gridworld.sample_trajectories(problem, grid.size, policy, episodes, seed)
 
 
 def features(kind: str, grid: GridworldConfig) -> np.ndarray:
