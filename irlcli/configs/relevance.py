@@ -290,8 +290,7 @@ def relevant_transfer(
 
 
 def _check_updated(sac: SACConfig, total_steps: int) -> None:
-    size = sac.n_envs * sac.n_steps
-    steps = -(-total_steps // size) * size
+    steps = sac.rounds(total_steps) * sac.steps_per_round
     if sac.learning_starts >= steps:
         raise UsageError(
             f"transfer.sac.learning_starts = {sac.learning_starts} leaves no update: training has "

@@ -140,6 +140,15 @@ class SACConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     normalise_observations: bool = True
     normalise_rewards: bool = True
 
+    @property
+    def steps_per_round(self) -> int:
+        """Of all worlds together."""
+        return self.n_steps * self.n_envs
+
+    def rounds(self, total_steps: int) -> int:
+        """Rounds that make up at least ``total_steps``."""
+        return -(-total_steps // self.steps_per_round)
+
 
 class FromStudentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Retraining that begins as the reward's student: few steps, a rate that falls to zero."""

@@ -177,7 +177,7 @@ class AIRL:
         """The rewards [T, N] of ``policy`` for its rollout, by the current discriminator."""
         data = self.view.of(rollout.transitions(slice(None), self._horizon))
         log_probs = torch.as_tensor(rollout.log_probs.ravel())
-        if self.view.clipped:
+        if self.view.clipped and self.config.policy_reward == "f-log-pi":
             log_probs = self.view.log_prob(policy, data)
         reward = policy_reward(
             self.model,

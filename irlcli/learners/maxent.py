@@ -209,10 +209,10 @@ class MaxEnt:
         penalty_warmup: int = 0,
     ):
         features = np.asarray(features, dtype=np.float64)
-        self._risks = stack_risks(risks)
         self._settings, self._horizon = settings, horizon
         self._kinds, self._n_kinds = kinds, len(features)
-        self._risks = self._risks._replace(occupancy=self._visits(self._risks.occupancy))
+        stacked = stack_risks(risks)
+        self._risks = stacked._replace(occupancy=self._visits(stacked.occupancy))
         self._expert = _expert_occupancy(self._risks)
         self._penalty = occupancy_penalty(penalty)
         self._penalty_weight = np.asarray(penalty_weight)

@@ -47,9 +47,9 @@ def starts_by(ended: np.ndarray, latest: int) -> np.ndarray:
 
 
 class Replay:
-    """A uniform sample of the episodes of all past rounds, for each setting.
+    """A sample of the episodes of all past rounds, for each setting.
 
-    Early episodes stay as likely as late ones (reservoir sampling, Vitter 1985, algorithm R):
+    Every round adds equally many episodes, and all past rounds stay equally likely (reservoir sampling, Vitter 1985, algorithm R):
     otherwise the discriminator forgets what the policy no longer does.
 
     Args:

@@ -1,4 +1,4 @@
-"""The risk of adversarial learners, which penalties also need of parts of a batch."""
+"""The risk of adversarial learners. Some penalties compute it on halves of a batch too."""
 
 from __future__ import annotations
 

@@ -59,10 +59,12 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
     found = []
     for r in cells.itertuples():
         if failed_to_imitate(r):
-            share = "" if r.of_expert is pd.NA else f" ({r.of_expert:.1%} of the expert's return)"
+            least = r.least_of_expert
+            share = "" if least is pd.NA else f" ({least:.1%} of its return)"
             found.append(
-                f"Not imitated: {r.row}, {title(r.agent)}: in distribution the student stays below "
-                f"{IMITATED:.0%} of the expert{share}. Do not interpret gaps to other methods."
+                f"Not imitated: {r.row}, {title(r.agent)}: in a training setting the student stays "
+                f"below {IMITATED:.0%} of the expert{share}, in the mean over seeds. Do not interpret gaps "
+                "to other methods."
             )
     return found
 

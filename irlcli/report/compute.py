@@ -36,7 +36,7 @@ from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
 from irlcli.report.reward_quality import Judgement, difference, judge
 from irlcli.report.statistics import compare, holm, paired_p, summarise
 
-# A student imitates if its return is within a fifth of its expert's.
+# A student imitates if its return is within a fifth of its expert's, in every training setting.
 IMITATED = 0.8
 _DIAGNOSTICS = (
     "accuracy",
@@ -76,7 +76,10 @@ def whole_seeds(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
 
     Points of agents without seeds stay.
     """
-    lacking = {(c.row, c.agent, c.measure, c.place, c.seed) for c in p.cells if not c.run}
+    unseen = {row.name: row.unseen for row in p.rows}
+    lacking = {
+        (c.row, c.agent, c.measure, c.place or unseen[c.row], c.seed) for c in p.cells if not c.run
+    }
     columns = ["row", "agent", "measure", "setting", "seed"]
     kept = [key not in lacking for key in points[columns].itertuples(index=False, name=None)]
     return points[kept]
@@ -123,8 +126,10 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     ``deviation`` (n - 1), ``low`` and ``high`` (95 % bootstrap interval) and ``iqm`` of the true
     return over seeds; ``progress``, its mean; ``complete``, whether all evaluations exist;
     ``partial``, whether a seed in the mean lacks some; ``mixed``, whether the runs behind them
-    differ in code or libraries; ``of_expert``, the mean over that of the training settings' experts,
-    in distribution; ``imitated``, see :func:`imitates`; ``between_retrainings``, see :func:`between_retrainings`.
+    differ in code or libraries; ``of_expert``, in distribution the mean over settings of the share
+    of the setting's expert's return, and ``least_of_expert``, the smallest of these shares;
+    ``imitated``, whether a student imitates (:func:`imitates`) in every training setting, in the
+    mean over seeds; ``between_retrainings``, see :func:`between_retrainings`.
     """
     found = []
     for row in p.rows:
@@ -160,27 +165,43 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "mixed": is_mixed(origins(p, evaluations(planned))),
                 }
             )
-    return _with_imitation(p, pd.DataFrame(found))
+    return _with_imitation(p, points, pd.DataFrame(found))
 
 
-def _with_imitation(p: Parameters, table: pd.DataFrame) -> pd.DataFrame:
-    """``table`` with the columns ``of_expert`` and ``imitated``."""
-    experts = table[(table["agent"] == "expert") & (table["measure"] == "id") & table["complete"]]
-    expert_means = experts.set_index("row")["mean"].to_dict()
-    of_expert, imitated = [], []
+def _with_imitation(p: Parameters, points: pd.DataFrame, table: pd.DataFrame) -> pd.DataFrame:
+    """``table`` with the columns ``of_expert``, ``least_of_expert`` and ``imitated``."""
+    whole = table[(table["agent"] == "expert") & (table["measure"] == "id") & table["complete"]]
+    shares_of: list[tuple[float | None, float | None, bool | None]] = []
     for r in table.itertuples():
-        expert, mean = expert_means.get(r.row), None if pd.isna(r.mean) else r.mean
-        is_student = r.agent in p.methods
-        known = r.measure in IN_DISTRIBUTION and expert is not None and mean is not None
+        is_student = r.agent in p.methods and r.measure == "id"
         # A student's evaluation covers all training settings, the others have one for each.
-        whole = r.complete or (is_student and r.measure == "id")
-        compared = known and whole and r.agent != "expert"
-        of_expert.append(mean / expert if compared and expert > 0 else None)
-        imitates_ = known and is_student and r.measure == "id"
-        imitated.append(imitates(mean, expert) if imitates_ else None)
+        compared = (
+            r.measure in IN_DISTRIBUTION and r.agent != "expert" and (r.complete or is_student)
+        )
+        earned = _by_setting(points, r.row, r.agent, r.measure)
+        if not compared or r.row not in set(whole["row"]) or earned.empty:
+            shares_of.append((None, None, None))
+            continue
+        experts = _by_setting(points, r.row, "expert", "id")
+        shares = (earned / experts).where(experts > 0)
+        known = shares.notna().all()
+        mean, least = (shares.mean(), shares.min()) if known else (None, None)
+        reached = [imitates(earned.get(setting), experts[setting]) for setting in experts.index]
+        imitated = all(reached) if is_student and None not in reached else None
+        shares_of.append((mean, least, imitated))
+    means, least_shares, imitations = zip(*shares_of, strict=True)
     return table.assign(
-        of_expert=pd.array(of_expert, "Float64"), imitated=pd.array(imitated, "boolean")
+        of_expert=pd.array(means, "Float64"),
+        least_of_expert=pd.array(least_shares, "Float64"),
+        imitated=pd.array(imitations, "boolean"),
     )
+
+
+def _by_setting(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.Series:
+    """The mean true return over seeds of each setting; a seed's is the mean of its retrainings."""
+    of = points_of(points, row, agent, measure).astype({"true_return": float})
+    means = of.groupby(["setting", "seed"], dropna=False)["true_return"].mean()
+    return means.groupby("setting").mean()
 
 
 def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) -> pd.DataFrame:

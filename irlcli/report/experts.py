@@ -34,7 +34,7 @@ def summarise(
 ) -> pd.DataFrame:
     """A row per setting: the returns of expert, idle and random agent, and the expert's training.
 
-    ``stands`` is ``done``, or what a missing evaluation waits for. Times are in seconds.
+    ``status`` is ``done``, or what a missing evaluation waits for. Times are in seconds.
 
     Args:
         cells: the wanted evaluations; rows are ``ENV KNOB``.
@@ -70,7 +70,7 @@ def summarise(
                 "seconds": trained[0].seconds if trained else None,
                 "resumed": trained[0].resumed if trained else None,
                 "commit": ", ".join(commits(trained)) if trained else None,
-                "stands": "done" if cell.run else cell.why,
+                "status": "done" if cell.run else cell.why,
             }
         )
     return pd.DataFrame(rows)
@@ -88,7 +88,7 @@ def text_table(found: pd.DataFrame) -> Table:
             [
                 f"{row.env} {row.setting}",
                 row.use,
-                value if row.stands == "done" else row.stands,
+                value if row.status == "done" else row.status,
                 *(_text(v) for v in (row.progress, row.idle_return, row.random_return)),
                 f"{row.steps:,}",
                 took,

@@ -202,11 +202,12 @@ def draw(
         lines: as :func:`curves` returns them.
         seed: the dataset that the panels show.
     """
+    drawn = zip(maze.bars, ("solid", "dotted"), strict=False)
+    routes = " and ".join(f"{setting} ({style})" for setting, style in drawn)
     caption = (
         f"Pictures: dataset {seed}, the first one. (b)-(h): recovered reward of each cell, each "
-        "panel on its own colour scale. White crosses: the bars of the unseen mazes\n(blocked=1 has "
-        "the left one, blocked=2 both). Orange: route of the reward's optimal policy in blocked=1 "
-        "(solid) and blocked=2 (dotted) if no move slips; it ends at the dot.\nCurves and table: "
+        "panel on its own colour scale. White crosses: the bars of the unseen mazes.\nOrange: route of the "
+        f"reward's optimal policy in {routes} if no move slips; it ends at the dot.\nCurves and table: "
         f"means over {summarised['datasets'].iloc[0]} datasets, with bootstrap 95 % intervals."
     )
     with matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):

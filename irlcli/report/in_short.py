@@ -44,6 +44,12 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
     return lines
 
 
+def _p(test: Any) -> str:
+    """Welch's p, and Holm's where other rows make it larger."""
+    own, adjusted = p_value(test.p_welch), p_value(test.p_welch_holm)
+    return f"p {own}" + ("" if own == adjusted else f", adjusted by Holm {adjusted}")
+
+
 def _verdict(test: Any) -> str:
     """Whether the pair of methods of ``test`` differs, and what difference would have been found."""
     x, y = title(test.x), title(test.y)
@@ -58,6 +64,6 @@ def _verdict(test: Any) -> str:
         claim = f"{x} earns significantly {more} than {y}"
     return (
         f"{claim}: {test.difference:+.1f} (95 % interval {test.low:.1f} to {test.high:.1f}, "
-        f"p {p_value(test.p_welch_holm)}). A difference of {test.detectable:.1f} would be found with "
+        f"{_p(test)}). A difference of {test.detectable:.1f} would be found with "
         "a power of 80 %."
     )

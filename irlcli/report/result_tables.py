@@ -11,25 +11,28 @@ from scipy.stats import ttest_ind_from_stats
 
 from irlcli.data.descriptions import Verdict
 from irlcli.labels import duration, steps, steps_of_all_restarts
+from irlcli.methods import METHODS
 from irlcli.report import paper
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, PROGRESS, title
-from irlcli.report.compute import failed_to_imitate
+from irlcli.report.compute import IMITATED, failed_to_imitate
 from irlcli.report.lineage import commits, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
 from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
 from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
-    "Mean true return ± standard deviation over seeds. p: Welch's test, "
-    f"{title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a p-value. "
-    "Training experts, reused: the experts of the training settings, each evaluated where the students "
+    "Mean true return ± standard deviation over seeds. Training experts, reused: the experts of the training settings, each evaluated where the students "
     "are, their mean: the return without learning a reward."
+)
+_TEST_NOTE = (
+    f"p: Welch's test, {title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a "
+    "p-value."
 )
 # Patterns of cells, and what to say below a table that has such a cell.
 _MARKS = {
     r"\(\d+/\d+\)": "(3/5): three of five seeds exist.",
     r"\(part\)": "(part): some evaluations are missing.",
-    "†": "† not imitated in distribution.",
+    "†": f"† in a training setting the student stays below {IMITATED:.0%} of the expert.",
     "‡": "‡ runs of more than one commit or set of libraries.",
     "^progress$": PROGRESS,
     "^ant ": "An idle ant earns about 600.",
@@ -69,7 +72,7 @@ _QUALITY_NOTE = (
 )
 _COMPARISON_NOTE = (
     "Difference of the means, with its 95 % interval by Welch's test. Detectable: the difference that "
-    "Student's test at 5 % would find with a power of 80 %, if the deviations are those of these seeds. "
+    "the test would find at 5 % with a power of 80 %, if the deviations are those of these seeds. "
     "Two-sided p-values. Welch's test is the primary one. Holm: adjusted over the rows, "
     "separately for each measure and pair of methods; in an ablation over all rows and variants "
     "of a measure. Paired: t-test over the seeds that both methods have (their number in "
@@ -92,15 +95,15 @@ _DISCRIMINATOR_NOTE = (
 _CELL_NOTE = (
     "95 %: percentile bootstrap interval of the mean over seeds, too narrow with few seeds. IQM: "
     "mean of the middle half of the seeds. Retrainings: standard deviation between policies "
-    "trained on one reward, pooled over rewards; the sd over seeds is of their means. Expert, "
-    "random and idle are one policy each; the reused experts are one policy per training "
-    "setting."
+    "trained on one reward, pooled over rewards; the sd over seeds is of their means. Random and idle are one policy "
+    "each, and so is the held-out setting's expert; in distribution there is one expert per training setting, "
+    "and the reused experts are these."
 )
 _BUDGET_NOTE = (
     "Steps: the budget in whole rounds; the steps of challengers are not counted. "
     "Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
     "where the table has its own, by method and seed where it was chosen by leaving a setting "
-    "out. Round: the one that was kept. At most: training could end earlier by "
+    "out. Kept: the round, or of how many rounds the mean. At most: training could end earlier by "
     "airl.plateau_rounds; `stopped_after` in reward.json is the round."
 )
 _COST_NOTE = (
@@ -113,7 +116,7 @@ def measures(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
     """A table per measure. The note below the first explains the marks in all of them."""
     tables = [_measure(p, measure, cells, comparisons) for measure in p.measures]
     seen = [cell for table in tables for line in table.rows for cell in line]
-    notes = [_MAIN_NOTE]
+    notes = [_MAIN_NOTE, *([_TEST_NOTE] if "p" in tables[0].columns else [])]
     notes += [note for mark, note in _MARKS.items() if any(re.search(mark, cell) for cell in seen)]
     if p.retrainings > 1:
         notes.append(_RETRAININGS_NOTE.format(p.retrainings))
@@ -128,6 +131,7 @@ def _measure(p: Parameters, measure: str, cells: pd.DataFrame, comparisons: pd.D
     agents += [] if in_distribution else ["random", "idle"]
     first = comparisons[(comparisons["x"] == "irm") & (comparisons["y"] == "erm")]
     tested = {r.row: r for r in first[first["measure"] == measure].itertuples()}
+    compared = not first.empty
     lines = []
     for row in p.rows:
         own = {
@@ -139,13 +143,13 @@ def _measure(p: Parameters, measure: str, cells: pd.DataFrame, comparisons: pd.D
         where = f"{row.name} = {', '.join(text.partition('=')[2] for text in values)}"
         test = tested.get(row.name)
         tests = ["-", "-"] if test is None else [p_value(test.p_welch), p_value(test.p_welch_holm)]
-        lines.append([where, "return", *(_cell(own[a]) for a in agents), *tests])
+        own_lines = [["return", *(_cell(own[a]) for a in agents), *tests]]
         if any(not pd.isna(own[a].progress) for a in agents):
-            lines.append([where, "progress", *(number(own[a].progress) for a in agents), "", ""])
+            own_lines.append(["progress", *(number(own[a].progress) for a in agents), "", ""])
         if in_distribution:
             ratios = {a: own[a].of_expert for a in agents if a != "expert"}
             shares = {a: "-" if r is pd.NA else f"{r:.0%}" for a, r in ratios.items()}
-            lines.append([where, "of the expert", *(shares.get(a, "") for a in agents), "", ""])
+            own_lines.append(["of the expert", *(shares.get(a, "") for a in agents), "", ""])
         printed = paper_row(p, row, measure)
         if printed is not None:
             texts = {
@@ -153,8 +157,9 @@ def _measure(p: Parameters, measure: str, cells: pd.DataFrame, comparisons: pd.D
                 for a, v in (("erm", printed.erm), ("irm", printed.irm), ("expert", printed.expert))
             }
             welch = p_value(_paper_p(printed, equal_variances=False))
-            lines.append([where, "paper", *(texts.get(a, "") for a in agents), welch, ""])
-    columns = ["setting", "", *(title(a) for a in agents), "p", "Holm"]
+            own_lines.append(["paper", *(texts.get(a, "") for a in agents), welch, ""])
+        lines += [[where, *line] if compared else [where, *line[:-2]] for line in own_lines]
+    columns = ["setting", "", *(title(a) for a in agents), *(["p", "Holm"] if compared else [])]
     return Table(MEASURES[measure], "", columns, lines, heads=2)
 
 
@@ -375,13 +380,10 @@ def budgets(p: Parameters) -> Table:
                 ", ".join(map(str, row.demonstrations)),
                 ("at most " if config["airl"].get("plateau_rounds") else "")
                 + f"{steps(config['airl']):,}",
-                ", ".join(
-                    [
-                        f"{config['airl']['penalty_weight']:g}",
-                        *(f"{run}: {weight:g}" for run, weight in row.chosen.items()),
-                    ]
-                ),
-                config["airl"]["select"],
+                _weights(p, row),
+                f"mean of {config['airl']['averaged_rounds']}"
+                if config["airl"].get("averaged_rounds")
+                else config["airl"]["select"],
                 f"{steps_of_all_restarts(transfer):,}"
                 if {"transfer", "transfer-id"} & set(p.measures)
                 else "-",
@@ -391,12 +393,20 @@ def budgets(p: Parameters) -> Table:
                 str(config["evaluation"]["episodes"]),
             ]
         )
-    columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda", "round"]
+    columns = ["row", "expert steps", "demonstrations", "AIRL steps", "lambda", "kept"]
     columns += ["transfer steps", "from the student", "evaluation episodes"]
     note = _BUDGET_NOTE
     if p.variants:
         note += f" Of the variant {p.variants[0].name}; the others may differ."
     return Table("Budgets", note, columns, lines)
+
+
+def _weights(p: Parameters, row: Row) -> str:
+    """Lambda of the config, and those of methods and runs that have their own; ``-`` without penalty."""
+    if all(method in METHODS and METHODS[method].penalty == "none" for method in p.methods):
+        return "-"
+    own = [f"{run}: {weight:g}" for run, weight in row.chosen.items()]
+    return ", ".join([f"{row.config['airl']['penalty_weight']:g}", *own])
 
 
 def costs(p: Parameters) -> Table:

@@ -1,6 +1,7 @@
 """PPO (Schulman et al. 2017), as stable-baselines3 implements it, trained in seeded rounds.
 
-Only Adam's eps differs from stable-baselines3's by default, see :class:`irlcli.configs.PPOConfig`.
+Of what a config does not set, only Adam's eps differs from stable-baselines3's, see
+:class:`irlcli.configs.PPOConfig`.
 
 A round seeds every generator from (purpose, seed, round), starts fresh episodes, collects one or
 more rollouts and updates on each. Only the network, its optimiser, running moments and a step

@@ -110,12 +110,12 @@ class SACTrainer:
     @property
     def steps_per_round(self) -> int:
         """Environment steps of one round."""
-        return self.sac.n_steps * self.sac.n_envs
+        return self.sac.steps_per_round
 
     @property
     def rounds(self) -> int:
         """Rounds that make up at least ``total_steps``."""
-        return -(-self.total_steps // self.steps_per_round)
+        return self.sac.rounds(self.total_steps)
 
     @property
     def policy(self) -> Policy:

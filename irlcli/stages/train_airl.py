@@ -364,7 +364,8 @@ def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping
     def stop(rows: Sequence[Mapping[str, Any]]) -> bool:
         if isinstance(airl.plateau_rounds, UnsetType):
             return False
-        # The loss changes until lambda has its full value. One round later than full_weight_from().
+        # The loss changes until lambda has its full value. With a penalty this is one round later
+        # than full_weight_from().
         first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
         newest = rows[-2 * airl.plateau_rounds * settings :]
         return plateaued(cross_entropies(newest, first), airl.plateau_rounds)

@@ -41,7 +41,7 @@ def test_a_setting_has_its_experts_return_and_training():
     found = summarised().set_index("setting")
     there = found.loc["bounce=0.1"]
     assert (there["true_return"], there["random_return"], there["seconds"]) == (250.0, -200.0, 90.0)
-    assert (there["use"], there["stands"], there["commit"]) == ("trained in", "done", "c0ffee")
+    assert (there["use"], there["status"], there["commit"]) == ("trained in", "done", "c0ffee")
     assert there["steps"] == 1000
     missing = found.loc["bounce=0.9"]
     assert missing["use"] == "held out" and pd.isna(missing["true_return"])

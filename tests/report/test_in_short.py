@@ -42,8 +42,8 @@ def test_significance_is_that_after_holm():
 
 
 def test_the_detectable_difference_follows_the_claim():
-    """Deviations of 1 and sqrt(7): pooled 2, times 3.07 for three seeds each (Cohen's d)."""
-    assert "A difference of 6.1 would be found with a power of 80 %." in lines(complete())[BOUNCE]
+    """Deviations of 1 and sqrt(7), three seeds each: Welch's test has 2.6 degrees of freedom."""
+    assert "A difference of 7.6 would be found with a power of 80 %." in lines(complete())[BOUNCE]
 
 
 def test_one_seed_has_returns_and_no_test():
