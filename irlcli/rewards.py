@@ -68,6 +68,11 @@ class LearnedReward:
         space = ActionSpace(self.discrete, self.action_size, none, none, self.choices)
         kind = np.int64 if self.discrete else np.float32
         observations = np.ascontiguousarray(obs, dtype=np.float32)
+        if observations.ndim != 2:
+            raise ValueError(
+                f"obs is {list(observations.shape)}, not [B, {self.observation_size}]: one transition "
+                "is a batch of 1, obs[None]"
+            )
         size = len(observations)
         data = Transitions(
             observations=observations,

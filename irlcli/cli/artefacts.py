@@ -105,9 +105,13 @@ def _tree(index: Index, artefact: Artefact, descendants: tuple[str, ...]) -> dic
     record = artefact.manifest.record
     descendants = (*descendants, artefact.id)
     inputs = []
+    recorded = artefact.provenance().get("inputs") or {}
     for role, sources in index.parents(artefact).items():
-        # Inputs are known by content. A descendant may hold an equal file: it is not an ancestor.
-        source = next((s for s in sources if s.id not in descendants), None)
+        # Inputs are known by content. Several artefacts may hold it: the recorded one comes first, and
+        # a descendant is no ancestor.
+        made_from = str(recorded.get(role, "")).partition("/")[0]
+        others = [source for source in sources if source.id not in descendants]
+        source = min(others, key=lambda s: s.id != made_from, default=None)
         origin = _tree(index, source, descendants) if source is not None else None
         inputs.append({"role": role, "sha256": record.inputs[role], "from": origin})
     return {

@@ -335,8 +335,10 @@ def _raise_for(outcome: "Outcome", plan: "Plan", continue_hint: str) -> None:
     if not outcome.exit_code:
         return
     total = len(plan.tasks)
-    there = len(outcome.existed) + len(outcome.copied) + len(outcome.made)
     if outcome.interrupted:
+        # Steps may have ended after the signal.
+        plan.lookup.forget_missing()
+        there = sum(plan.step(name).status == "HIT" for name in plan.tasks)
         error: IrlError = Interrupted(f"stopped: {there} of {total} steps exist", continue_hint)
     else:
         names = ", ".join(list(outcome.failed)[:3])

@@ -77,6 +77,10 @@ def report(
         "--out": directory,
         "--name": name,
     }
+    if kind not in ("returns", "table2") and refs:
+        from irlcli.experiments.tables import load_table
+
+        load_table(kind, file)
     if kind != "returns" and refs:
         raise UsageError(
             f"{kind} takes no references", "its results are found by their configuration"

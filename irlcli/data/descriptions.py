@@ -412,7 +412,7 @@ def parse(value: Any, form: type[Form], source: Path | str) -> Form:
             environment(env)
         except UsageError as error:
             raise IntegrityError(
-                f"{source}: its description is malformed ({error.message})",
+                f"{source}: its description names an {error.message}",
                 "if the environment is your own, name its TOML file with --env",
             ) from None
         for setting in settings:

@@ -11,7 +11,8 @@ from irlcli.store import Artefact, Index
 def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
     """The parameters behind an evaluation that all its seeds share, by ``STAGE.FIELD``.
 
-    They exclude the seeds, and a lambda that was chosen for each seed. An input from outside the
+    They exclude the seeds of training, and a lambda that was chosen for each seed. The seed of the
+    evaluation is one of them: other start states are another measurement. An input from outside the
     store contributes only its content. The names for a reward other than the policy's own begin
     with ``reward.``.
     """
@@ -22,7 +23,8 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
         record = at.manifest.record
         for name, value in flat(record.parameters):
             chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
-            if name not in ("seed", "settings", "setting") and not chosen:
+            unshared = name in ("settings", "setting") or (name == "seed" and at is not artefact)
+            if not unshared and not chosen:
                 found[f"{prefix}{record.stage}.{name}"] = value
         for role in ("policy", "reward", "demonstrations"):
             measures = record.stage == "evaluate" and role == "reward"
@@ -31,7 +33,7 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
                 continue
             makers = index.holders(sha)
             if role == "demonstrations":
-                found[f"{prefix}{record.stage}.{role}"] = sha
+                found[f"{prefix}{record.stage}.{role}"] = makers[0].id if makers else sha
             elif makers:
                 pending.append((makers[0], "reward." if measures else prefix))
     return found

@@ -48,7 +48,7 @@ def introduce(artefact: Artefact) -> None:
         assert known.own is not None
         raise UsageError(
             f"artefact {artefact.id} was made in another {made.name!r} than {known.own.source}",
-            "name artefacts of one and the same environment, or its file with --env",
+            "name artefacts of one and the same environment",
         )
 
 

@@ -118,6 +118,8 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
             parts += [
                 f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
+            if r.uncertain:
+                parts.append(f"{r.uncertain} verdicts are uncertain: within two standard errors.")
             found.append(
                 f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.judged} retrained "
                 f"policies. {' '.join(parts)}"

@@ -233,7 +233,8 @@ def _tree(p: Parameters, id16: str, indent: str) -> list[str]:
 
 
 def _configs(p: Parameters) -> str:
-    parts = [
+    parts = ["<p>Configs are those of the rows. A method sets its own grouping and penalty.</p>"]
+    parts += [
         f"<details><summary>{escape(row.name)}</summary><pre>"
         f"{escape(json.dumps(row.config, indent=1, sort_keys=True))}</pre></details>"
         for row in p.rows
