@@ -144,6 +144,7 @@ def test_what_it_cannot_use_is_named(smoke_store, tmp_path):
     obs, act, following, done = steps("half-cheetah", 5)
     for arguments, message in (
         ((obs[:, :8], act, following, done), r"obs is \[5, 8\], not \[5, 17\]"),
+        ((obs[0], act[0], following[0], False), r"obs is \[17\], not \[B, 17\]"),
         ((obs, act[:, 0], following, done), r"act is \[5\], not \[5, 6\]"),
         ((obs, act, following[:4], done), r"next_obs is \[4, 17\], not \[5, 17\]"),
         ((obs, act, following, False), r"done is \[\], not \[5\]"),

@@ -70,4 +70,4 @@ def run(job: Job) -> None:
     experts.draw(job.output, p.cells, learning)
 
 
-STAGE = Stage("report-experts", 3, run)
+STAGE = Stage("report-experts", 4, run)

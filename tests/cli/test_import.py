@@ -35,6 +35,31 @@ def imported(irl, store, *words):
     return Store(store.path).resolve(done.out.strip().rpartition("/")[2]).artefact
 
 
+def test_lineage_names_the_recording_that_was_used(irl, store_copy, exported, tmp_path):
+    """Other files may hold the same episodes."""
+    used = imported(irl, store_copy, exported, *LANDER)
+    common = ["--store", store_copy.path]
+    learn = [
+        "train-airl",
+        "--demos",
+        used.id,
+        "--method",
+        "bc",
+        "--profile",
+        "smoke",
+        "--name",
+        "bc",
+    ]
+    done = irl(*learn, *common)
+    assert done.code == 0, done.err
+    for compression in ("none", "gzip", "zstd", "snappy"):
+        copy = tmp_path / f"{compression}.parquet"
+        pq.write_table(pq.read_table(exported), copy, compression=compression)
+        imported(irl, store_copy, copy, *LANDER)
+    tree = json.loads(irl("lineage", "bc", "--json", *common).out)
+    assert [item["from"]["id"] for item in tree["inputs"]] == [used.id]
+
+
 def test_an_output_path_that_links_to_itself_is_a_file_that_exists(irl, store_copy, tmp_path):
     for name, target in (("loop", "loop"), ("dangling", "nowhere")):
         (tmp_path / name).symlink_to(tmp_path / target)
