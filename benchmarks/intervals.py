@@ -1,7 +1,8 @@
 """IRM minus ERM in published reports, from their ``seeds.csv``: interval and detectable difference.
 
-For reports that were written before these columns existed. Also the mean over all methods, seed by
-seed, of what retraining earns above the student (t-test). Run with
+For reports that were written before these columns existed. Also the share of each training setting's
+expert that the students earn in the mean over seeds, and the mean over all methods, seed by seed, of
+what retraining earns above the student (t-test). Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
 """
 
@@ -31,6 +32,7 @@ def main(reports: list[Path]) -> None:
                         f"{report.name}: {row}, {measure}: IRM - ERM {found.difference:.1f} "
                         f"[{low:.1f}, {high:.1f}], detectable {found.detectable:.1f}, p {found.welch:.3f}"
                     )
+        _print_imitation(report.name, seeds)
         for row, points in learned.groupby("row", sort=False):
             means = points.pivot_table("true_return", "seed", "measure")
             if {"transfer", "zero-shot"} <= {*means}:
@@ -41,6 +43,18 @@ def main(reports: list[Path]) -> None:
                 print(
                     f"{report.name}: {row}, all methods: transfer - zero-shot {gain:.1f}, p {shown}"
                 )
+
+
+def _print_imitation(name: str, seeds: pd.DataFrame) -> None:
+    means = (
+        seeds[seeds["measure"] == "id"].groupby(["row", "agent", "setting"])["true_return"].mean()
+    )
+    for (row, agent), earned in means.groupby(level=["row", "agent"], sort=False):
+        if agent not in METHODS or (row, "expert") not in means:
+            continue
+        shares = (earned.droplevel(["row", "agent"]) / means[row, "expert"]).items()
+        shown = ", ".join(f"{setting} {share:.1%}" for setting, share in shares)
+        print(f"{name}: {row}, {agent}: student's share of the expert: {shown}")
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
                 f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
             if r.uncertain:
-                parts.append(f"{r.uncertain} verdicts are uncertain: within two standard errors.")
+                parts.append(f"Uncertain (within two standard errors): {r.uncertain}.")
             found.append(
                 f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.judged} retrained "
                 f"policies. {' '.join(parts)}"
