@@ -32,6 +32,18 @@ def title(agent: str) -> str:
     return BASELINES.get(agent, agent)
 
 
+def beside(measure: str) -> tuple[str, ...]:
+    """The agents without a reward that are shown beside ``measure``."""
+    return ("expert", "reused") if measure in IN_DISTRIBUTION else tuple(BASELINES)
+
+
+def own_measure(agent: str, measure: str) -> str:
+    """``measure``; of an agent without a reward the one in the same settings, ``id`` or ``ood``."""
+    if agent not in BASELINES:
+        return measure
+    return "id" if measure in IN_DISTRIBUTION else "ood"
+
+
 def colours(methods: tuple[str, ...]) -> dict[str, str]:
     """A colour for each of ``methods``. Those outside the table share a cycle of five."""
     others = [name for name in methods if name not in METHODS]

@@ -150,7 +150,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "row": row.name,
                     "agent": agent,
                     "measure": measure,
-                    "setting": ", ".join(row.trained) if measure in IN_DISTRIBUTION else row.unseen,
+                    "setting": ", ".join(row.settings_of(measure)),
                     "seeds": s.n,
                     "seeds_wanted": len(p.seeds) if agent in p.methods else 1,
                     "mean": s.mean,

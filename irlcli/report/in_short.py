@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, title
+from irlcli.report.agents import MEASURES, own_measure, title
 from irlcli.report.parameters import Parameters
 from irlcli.report.statistics import LEVEL
 from irlcli.report.text import number, p_value
@@ -20,14 +20,13 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
     if p.variants:
         return []
     measure = p.measures[0]
-    baseline = "id" if measure in IN_DISTRIBUTION else "ood"
     lines = []
     for row in p.rows:
         found = cells[cells["row"] == row.name]
         means = {
             r.agent: f"{title(r.agent)} {number(r.mean)}"
             for r in found[found["mean"].notna()].itertuples()
-            if r.measure == (baseline if r.agent in BASELINES else measure)
+            if r.measure == own_measure(r.agent, measure)
         }
         tested = comparisons[(comparisons["row"] == row.name) & (comparisons["measure"] == measure)]
         first = next(tested[tested["difference"].notna()].itertuples(), None)
@@ -37,8 +36,7 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
         if not any(method in means for method in methods):
             continue
         verdict = "" if first is None else f" {_verdict(first)}"
-        settings = row.trained if measure in IN_DISTRIBUTION else (row.unseen,)
-        where = ", ".join(text.partition("=")[2] for text in settings)
+        where = ", ".join(text.partition("=")[2] for text in row.settings_of(measure))
         what = MEASURES[measure].partition(":")[0].lower()
         lines.append(f"{row.name} = {where}, {what}, true return: {'; '.join(shown)}.{verdict}")
     return lines

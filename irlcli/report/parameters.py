@@ -103,6 +103,10 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
         """``ENV KNOB``."""
         return f"{self.env} {self.knob}"
 
+    def settings_of(self, measure: str) -> tuple[str, ...]:
+        """The settings in which ``measure`` is taken."""
+        return self.trained if measure in IN_DISTRIBUTION else (self.unseen,)
+
 
 class Code(msgspec.Struct, frozen=True, kw_only=True):
     """The code of a run: a commit, and a digest of uncommitted changes. None means unknown."""

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from irlcli.report import ablation
-from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, colours, title
+from irlcli.report.agents import IN_DISTRIBUTION, beside, colours, own_measure, title
 from irlcli.report.build import Report
 from irlcli.report.compute import sample
 from irlcli.report.drawing import offsets, panels, save
@@ -97,10 +97,9 @@ def _points(p: Parameters, report: Report) -> Figure:
 def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) -> None:
     ink = matplotlib.rcParams["text.color"]
     cells = report.cells[report.cells["row"] == row.name].set_index(["agent", "measure"])
-    there = measure in IN_DISTRIBUTION
     # Drawn even without a value, so that the legend has it.
-    for agent in ("expert", "reused") if there else BASELINES:
-        value = cells["mean"].get((agent, "id" if there else "ood"))
+    for agent in beside(measure):
+        value = cells["mean"].get((agent, own_measure(agent, measure)))
         axis.axhline(
             np.nan if pd.isna(value) else value,
             color=ink,
@@ -136,7 +135,7 @@ def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) ->
         range(len(p.methods)), [title(m).replace(", ", ",\n") for m in p.methods], size=7.5
     )
     axis.set_xlim(-0.6, len(p.methods) - 0.4)
-    axis.set_title(row.name if there else f"{row.env} {row.unseen}")
+    axis.set_title(row.name if measure in IN_DISTRIBUTION else f"{row.env} {row.unseen}")
     axis.grid(axis="y", alpha=0.25)
 
 

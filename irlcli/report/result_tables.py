@@ -13,7 +13,7 @@ from irlcli.data.descriptions import Verdict
 from irlcli.labels import duration, steps, steps_of_all_restarts
 from irlcli.methods import METHODS
 from irlcli.report import paper
-from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, MEASURES, PROGRESS, title
+from irlcli.report.agents import IN_DISTRIBUTION, MEASURES, PROGRESS, beside, own_measure, title
 from irlcli.report.compute import IMITATED, failed_to_imitate
 from irlcli.report.lineage import commits, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
@@ -125,10 +125,7 @@ def measures(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
 
 def _measure(p: Parameters, measure: str, cells: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """A line per row for its return, and more for progress and for the paper's numbers."""
-    in_distribution = measure in IN_DISTRIBUTION
-    baseline = "id" if in_distribution else "ood"
-    agents = [*p.methods, "expert", "reused"]
-    agents += [] if in_distribution else ["random", "idle"]
+    agents = [*p.methods, *beside(measure)]
     first = comparisons[(comparisons["x"] == "irm") & (comparisons["y"] == "erm")]
     tested = {r.row: r for r in first[first["measure"] == measure].itertuples()}
     compared = not first.empty
@@ -137,16 +134,16 @@ def _measure(p: Parameters, measure: str, cells: pd.DataFrame, comparisons: pd.D
         own = {
             r.agent: r
             for r in cells[cells["row"] == row.name].itertuples()
-            if r.measure == (baseline if r.agent in BASELINES else measure)
+            if r.measure == own_measure(r.agent, measure)
         }
-        values = row.trained if in_distribution else (row.unseen,)
-        where = f"{row.name} = {', '.join(text.partition('=')[2] for text in values)}"
+        values = ", ".join(text.partition("=")[2] for text in row.settings_of(measure))
+        where = f"{row.name} = {values}"
         test = tested.get(row.name)
         tests = ["-", "-"] if test is None else [p_value(test.p_welch), p_value(test.p_welch_holm)]
         own_lines = [["return", *(_cell(own[a]) for a in agents), *tests]]
         if any(not pd.isna(own[a].progress) for a in agents):
             own_lines.append(["progress", *(number(own[a].progress) for a in agents), "", ""])
-        if in_distribution:
+        if measure in IN_DISTRIBUTION:
             ratios = {a: own[a].of_expert for a in agents if a != "expert"}
             shares = {a: "-" if r is pd.NA else f"{r:.0%}" for a, r in ratios.items()}
             own_lines.append(["of the expert", *(shares.get(a, "") for a in agents), "", ""])
