@@ -10,6 +10,8 @@ import numpy as np
 from irlcli.store import Store
 
 if TYPE_CHECKING:
+    from gymnasium import Space
+
     from irlcli.learners.frozen import FrozenReward
     from irlcli.learners.standalone import StandaloneReward
 
@@ -98,6 +100,29 @@ class LearnedReward:
         if not np.isin(done, (0, 1)).all():
             raise ValueError("done must hold true or false")
         return self._frozen.of_steps(data)
+
+    def check_spaces(self, observation_space: Space, action_space: Space) -> None:
+        """Refuse an environment of other observations or actions, before its first step.
+
+        Raises:
+            ValueError: names both.
+        """
+        from gymnasium.spaces import Discrete, MultiDiscrete
+        from gymnasium.spaces.utils import flatdim
+
+        observed, acted = flatdim(observation_space), flatdim(action_space)
+        discrete = isinstance(action_space, Discrete | MultiDiscrete)
+        if (observed, acted, discrete) != (
+            self.observation_size,
+            self.action_size,
+            self.discrete,
+        ):
+            kinds = ("continuous", "discrete")
+            raise ValueError(
+                f"the environment has observations of size {observed} and {kinds[discrete]} actions of "
+                f"size {acted}, the reward takes {self.observation_size} and {kinds[self.discrete]} "
+                f"{self.action_size}"
+            )
 
     def module(self) -> StandaloneReward:
         """The same function of tensors, as a :class:`torch.nn.Module`."""

@@ -286,6 +286,17 @@ def test_discrete_actions_work_too(tmp_path):
             reward(still, [index], still, [False])
 
 
+def test_an_environment_of_other_spaces_is_refused_before_its_first_step(tmp_path):
+    path, _ = write_random_reward(tmp_path, "half-cheetah", fixed_horizon=False)
+    reward = irlcli.load_reward(path)
+    make = lambda: gymnasium.make("irlcli/LunarLander-v0")  # noqa: E731
+    message = "observations of size 8 and discrete actions of size 4, the reward takes 17"
+    with pytest.raises(ValueError, match=message):
+        irlcli.RewardWrapper(make(), reward)
+    with pytest.raises(ValueError, match=message):
+        irlcli.RewardVecEnvWrapper(DummyVecEnv([make]), reward)
+
+
 # The file
 
 

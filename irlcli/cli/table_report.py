@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from irlcli.cli import console as out
 from irlcli.cli.session import StageSession
+from irlcli.configs import PROFILES
 from irlcli.errors import NotFound, StageFailed, UsageError
 from irlcli.report.tables import EVERY_CELL
 from irlcli.requests.tables import TableChoice, needs_tag
@@ -40,10 +41,22 @@ def report_of(session: StageSession, choice: TableChoice, plan: "Plan") -> "Requ
         return report.request(plan, shlex.join(words))
     except NotFound as error:
         error.hint = (
-            f"`{_run_line(session, choice)}` makes them. --profile, --set, --seeds and --methods must "
-            "be those of the runs"
+            f"{_named(session, plan)}`{_run_line(session, choice)}` makes them. --profile, --set, --seeds "
+            "and --methods must be those of the runs"
         )
         raise
+
+
+def _named(session: StageSession, plan: "Plan") -> str:
+    """Which results of the table's steps have names in the store, for the hint."""
+    tag = f"{plan.selection.tag}."
+    steps = {name.removeprefix(tag) for name in plan.tasks}
+    parts = [name.partition(".") for name in session.store.names()]
+    found = {first for first, _, rest in parts if rest in steps}
+    if plan.selection.tag in found:
+        return "its results in the store have other keys: another config, or changed code. "
+    profiles = [f"--profile {name}" for name in PROFILES if name in found]
+    return f"there are results of {' and '.join(profiles)}. " if profiles else ""
 
 
 def _run_line(session: StageSession, choice: TableChoice) -> str:

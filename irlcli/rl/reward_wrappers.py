@@ -22,10 +22,14 @@ class RewardWrapper(gymnasium.Wrapper):
     Args:
         env: an environment of the kind that the reward was learned in.
         reward: what :func:`irlcli.load_reward` returns, or any function of that form.
+
+    Raises:
+        ValueError: a learned reward of other observations or actions.
     """
 
     def __init__(self, env: gymnasium.Env, reward: Reward):
         super().__init__(env)
+        _check_spaces(reward, env)
         self._reward = reward
         self._observation = np.empty(0)
 
@@ -59,10 +63,14 @@ class RewardVecEnvWrapper(VecEnvWrapper):
     Args:
         venv: environments of the kind that the reward was learned in.
         reward: what :func:`irlcli.load_reward` returns, or any function of that form.
+
+    Raises:
+        ValueError: a learned reward of other observations or actions.
     """
 
     def __init__(self, venv: VecEnv, reward: Reward):
         super().__init__(venv)
+        _check_spaces(reward, venv)
         self._reward = reward
         self._observations = np.empty(0)
         self._actions = np.empty(0)
@@ -93,6 +101,13 @@ class RewardVecEnvWrapper(VecEnvWrapper):
         learned = self._reward(self._observations, actions, successors, terminated)
         self._observations = following
         return observations, learned.astype(np.float32), dones, infos
+
+
+def _check_spaces(reward: Reward, env: gymnasium.Env | VecEnv) -> None:
+    # Only a learned reward knows which spaces it takes.
+    check = getattr(reward, "check_spaces", None)
+    if check is not None:
+        check(env.observation_space, env.action_space)
 
 
 def _flat(observation: Any) -> np.ndarray:

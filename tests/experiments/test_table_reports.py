@@ -340,6 +340,18 @@ def test_a_copied_report_is_whole_or_the_one_before(report, table_store, tmp_pat
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
+def test_results_of_another_profile_are_named(report, irl, table_store, tmp_path):
+    store = tmp_path / "runs"
+    shutil.copytree(table_store, store, symlinks=True)
+    for profile, hint in (
+        ("standard", "there are results of --profile standard"),
+        ("smoke", "its results in the store have other keys"),
+    ):
+        name = f"{profile}.lunar-lander.bounce.erm.0"
+        assert irl("name", "erm.0", name, "--store", store).code == 0
+        assert hint in report("table1", store, small=[]).err
+
+
 def test_a_profile_without_runs_is_no_table(report, irl, table_store):
     done = report("table1", table_store, small=[])
     assert done.code == 3
