@@ -79,7 +79,10 @@ def print_assessment(assessment: Assessment) -> None:
     ]
     columns = ["setting", "policy", "true return", "progress", "learned return"]
     out.print_table(columns, rows, stderr=True, optional=("progress",))
-    out.print_note("±: standard error over episodes; [low, high]: 95 % interval")
+    out.print_note(
+        "±: standard error over episodes; [low, high]: 95 % interval"
+        + ("; in all settings a policy counts once for each" if assessment.pooled else "")
+    )
     ranked = ["policies", "Spearman", "Pearson"]
     columns = ["setting", *ranked, *(f"{name}, lower half" for name in ranked)]
     columns += ["expert - idle", "return distance", "EPIC"]

@@ -181,7 +181,7 @@ def _interval(point: np.ndarray, draws: np.ndarray) -> Interval | None:
 def return_distance(members: Sequence[Member]) -> float | None:
     """Episode-return correlation pseudometric sqrt((1 - r) / 2) (Gleave et al. 2021, Sec. 5).
 
-    r is Pearson's over the episodes of the bank, each policy counting equally. 0: equal up to scale
+    r is Pearson's over the episodes of the bank, each policy counting equally in each setting. 0: equal up to scale
     and offset; 1: opposite. Unlike EPIC it depends on the policies.
     """
     true = np.concatenate([m.true for m in members])
