@@ -1,7 +1,9 @@
 """Seeds derived from a purpose, so that two uses of one seed do not share random numbers.
 
-Exceptions: random actions in a built-in environment (:func:`irlcli.rl.rollout.roll_out`); and, by
-torch and NumPy from one seed, the noise of a trained policy's actions and its minibatches.
+Exceptions: random actions in a built-in environment (:func:`irlcli.rl.rollout.roll_out`); by torch
+and NumPy from one seed, the noise of a trained policy's actions and its minibatches; the images
+under symmetries that all settings share before the first round of AIRL; and MaxEnt's held-out
+episodes, where the k-th trained and the k-th unseen setting share a stream.
 """
 
 import zlib
