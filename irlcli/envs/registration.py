@@ -6,7 +6,7 @@ Gymnasium 1 has no plugin entry points. Import this module to register the envir
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pkgutil import resolve_name
@@ -163,21 +163,13 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
         ) from error
     except (Exception, SystemExit) as error:
         knobs = {knob.argument: name for name, knob in spec.knobs.items()}
-        given = ", ".join(
-            f"{name}={value!r} ({f'knobs.{knobs[name]}.argument' if name in knobs else 'env.arguments'})"
-            for name, value in keywords.items()
-        )
+        named = {name: "env.arguments" for name in keywords}
+        named |= {knob: f"knobs.{name}.argument" for knob, name in knobs.items()}
+        given = ", ".join(f"{name}={value!r} ({named[name]})" for name, value in keywords.items())
         raise UsageError(
             f"{where} cannot be made{f' with {given}' if given else ''}: {described(error)[:300]}",
-            f"its own code refuses this{_named_by(spec, own, arguments)}; --debug shows where",
+            "the environment's own code refuses this; --debug shows where",
         ) from error
-
-
-def _named_by(spec: EnvironmentSpec, own: Own, arguments: Mapping[str, Any]) -> str:
-    """Which fields of its file name the arguments that it was made with."""
-    fields = [f"knobs.{name}.argument" for name, k in spec.knobs.items() if k.argument in arguments]
-    fields += [f"env.arguments.{name}" for name in own.arguments]
-    return f"; {' and '.join(fields)} named the argument" if fields else ""
 
 
 def _import(spec: EnvironmentSpec, own: Own) -> None:
