@@ -163,7 +163,7 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
         ) from error
     except (Exception, SystemExit) as error:
         knobs = {knob.argument: name for name, knob in spec.knobs.items()}
-        named = {name: "env.arguments" for name in keywords}
+        named = dict.fromkeys(keywords, "env.arguments")
         named |= {knob: f"knobs.{name}.argument" for knob, name in knobs.items()}
         given = ", ".join(f"{name}={value!r} ({named[name]})" for name, value in keywords.items())
         raise UsageError(
