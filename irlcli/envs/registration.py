@@ -162,9 +162,8 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
             f"{own.source}: env.id: {first_line(error)[:300]}", "is the id registered?"
         ) from error
     except (Exception, SystemExit) as error:
-        knobs = {knob.argument: name for name, knob in spec.knobs.items()}
         named = dict.fromkeys(keywords, "env.arguments")
-        named |= {knob: f"knobs.{name}.argument" for knob, name in knobs.items()}
+        named |= {k.argument: f"knobs.{name}.argument" for name, k in spec.knobs.items()}
         given = ", ".join(f"{name}={value!r} ({named[name]})" for name, value in keywords.items())
         raise UsageError(
             f"{where} cannot be made{f' with {given}' if given else ''}: {described(error)[:300]}",
