@@ -28,6 +28,7 @@ def record(tmp_path):
             "settings": SETTINGS["lunar-lander.engine-power"],
             "seed": seed,
             "targets": [200.0, 100.0],
+            "demonstrations": "demos",
             "limit": 60,
             "commit": "abc",
             "machine": "2 cores",
@@ -93,13 +94,16 @@ def test_a_partial_benchmark_says_what_is_missing(record, tmp_path):
     assert len((tmp_path / "checks.csv").read_text().splitlines()) == 3
 
 
-def test_only_a_run_stopped_by_a_lower_limit_is_repeated(record, tmp_path):
-    record("airl", 1, [0.5], "limit")
-    record("airl", 2, [0.95, 0.95], "goal")
-    assert enough(tmp_path / "airl.1.jsonl", 60)
-    assert not enough(tmp_path / "airl.1.jsonl", 1800)
-    assert enough(tmp_path / "airl.2.jsonl", 1800)
-    assert not enough(tmp_path / "airl.3.jsonl", 60)
+def test_a_run_is_repeated_after_a_lower_limit_or_on_other_demonstrations(record, tmp_path):
+    ended, reached = record("airl", 1, [0.5], "limit"), record("airl", 2, [0.95, 0.95], "goal")
+    first, second = tmp_path / "airl.1.jsonl", tmp_path / "airl.2.jsonl"
+    assert enough(first, ended.task, "demos", 60)
+    assert not enough(first, ended.task, "demos", 1800)
+    assert enough(second, reached.task, "demos", 1800)
+    assert not enough(second, reached.task, "others", 1800)
+    elsewhere = reached.task._replace(settings=("engine-power=2x",))
+    assert not enough(second, elsewhere, "demos", 1800)
+    assert not enough(tmp_path / "airl.3.jsonl", reached.task, "demos", 60)
 
 
 def test_experts_have_one_setting_and_students_all():

@@ -100,15 +100,19 @@ def _run_in(runs: Path, options: argparse.Namespace) -> None:
     wanted = tasks(settings, options.methods, options.seeds)
     records = options.out / "records"
     files = {task: records / f"{task.name}.jsonl" for task in wanted}
-    missing = [task for task in wanted if not enough(files[task], options.limit)]
     failed: list[str] = []
     if not options.report:
+        about = {row: _demonstrations(row, runs) for row in options.rows}
+        missing = [
+            task
+            for task in wanted
+            if not enough(files[task], task, about[task.row]["demonstrations"], options.limit)
+        ]
         theirs = any(METHODS[task.method].module == "theirs" for task in missing)
         if theirs and not options.peers_python.is_file():
             raise UsageError(f"{options.peers_python} does not exist", "make bench-peers makes it")
         for leftover in records.glob("*.part"):
             leftover.unlink()
-        about = {row: _demonstrations(row, runs) for row in options.rows}
         about_all = {"commit": _commit(), "machine": _machine(), "limit": options.limit}
         print(f"{len(missing)} of {len(wanted)} runs are missing", file=sys.stderr)
 
@@ -134,12 +138,13 @@ def _run_in(runs: Path, options: argparse.Namespace) -> None:
         raise StageFailed("no run has finished", "omit --report to run what is missing")
 
 
-def enough(path: Path, limit: float) -> bool:
-    """Whether a run is finished, and not by a lower limit than ``limit``."""
+def enough(path: Path, task: Task, demonstrations: str, limit: float) -> bool:
+    """Whether ``task`` is finished on these demonstrations, and not by a lower limit than ``limit``."""
     if not path.exists():
         return False
     run = read_run(path)
-    return run.end != "limit" or run.about["limit"] >= limit
+    same = run.task == task and run.about["demonstrations"] == demonstrations
+    return same and (run.end != "limit" or run.about["limit"] >= limit)
 
 
 def _execute(task: Task, run: dict[str, Any], runs: Path, peers: Path) -> str | None:
@@ -159,7 +164,7 @@ def _execute(task: Task, run: dict[str, Any], runs: Path, peers: Path) -> str | 
 def _demonstrations(row: str, directory: Path) -> dict[str, Any]:
     """The shipped demonstrations: as artefact, as Parquet file, and their mean return by setting."""
     source, _, _ = demonstrations(Store(_ZOO), row)
-    file = (directory / f"{row}.parquet").absolute()
+    file = (directory / f"{row}.{source.path.name}.parquet").absolute()
     if not file.exists():
         export = ["export", "demos", row, "--store", str(_ZOO), "--to", f"parquet:{file}"]
         subprocess.run(

@@ -22,7 +22,7 @@ from irlcli.report.tables import markdown_table
 
 # Okabe and Ito's colours, and Tol's; experts are never in a panel with students.
 _COLOURS = ["#0072B2", "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#117733", "#CC79A7", "#882255"]
-_NOTE = f"""Median over the seeds, and the range. A method earns 80 or 90 % of its experts' true return at the first
+_NOTE = f"""Median over the seeds, and the range; every value where a seed never got there. A method earns 80 or 90 % of its experts' true return at the first
 check at which the mean over the settings of (true return / expert's true return) is at least that, and is so at the next
 check, too. The expert's true return is that of the published demonstrations in `zoo/`. Checks: {EPISODES} episodes in
 each setting, with the policy's modes as actions, at the first end of a round after each multiple of {EVERY:,} steps. CPU
@@ -169,13 +169,19 @@ def _provenance(runs: Sequence[Run]) -> str:
         for module in ("ours", "theirs")
     }
     lines = [
-        f"- Commit: {listed(run.about['commit'] for run in runs)}",
+        f"- Commit: {listed(_of_commit(run.about['commit'], runs) for run in runs)}",
         f"- Limit: {listed(_number(run.about['limit']) for run in runs)} CPU seconds a run",
         f"- Machine: {listed(run.about['machine'] for run in runs)}",
         f"- `irlcli`: {versions['ours'] or 'not run'}",
         f"- Others: {versions['theirs'] or 'not run'}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _of_commit(commit: str, runs: Sequence[Run]) -> str:
+    """``commit`` and which runs it made."""
+    made = {f"{r.task.row} seed {r.task.seed}" for r in runs if r.about["commit"] == commit}
+    return f"{commit} ({', '.join(sorted(made))})"
 
 
 def _colour(method: str) -> str:

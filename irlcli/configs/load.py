@@ -7,7 +7,7 @@ variables are not read, so equal configs give equal artefacts wherever they run.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
@@ -32,6 +32,7 @@ _MANY = 1e6
 # A name besides those of the environments: settings/control.toml has the positive controls.
 CONTROL = "control"
 _INTERVENTIONS = dict[str, InterventionConfig]
+Form = TypeVar("Form")
 Layer = tuple[str, Mapping[str, Any]]
 Layers = Sequence[Layer]
 
@@ -164,7 +165,7 @@ def _stack(env: str, layers: Layers) -> Config:
         config,
         interventions=interventions,
         airl=_airl(checked),
-        transfer=msgspec.convert(_transfer(checked), TransferConfig),
+        transfer=_as(TransferConfig, _transfer(checked)),
     )
 
 
@@ -172,9 +173,9 @@ def _with_sections(knob: str, listed: InterventionConfig, layers: Layers) -> Int
     """``listed`` with the whole config of each section that the knob has different."""
     whole: dict[str, Any] = {"episodes": _episodes(knob, layers)}
     if listed.expert is not None:
-        whole["expert"] = msgspec.convert(_section("expert", layers, knob), ExpertConfig)
+        whole["expert"] = _as(ExpertConfig, _section("expert", layers, knob))
     if listed.transfer is not None or listed.expert is not None:
-        whole["transfer"] = msgspec.convert(_transfer(layers, knob), TransferConfig)
+        whole["transfer"] = _as(TransferConfig, _transfer(layers, knob))
     if listed.airl is not None or "transfer" in whole:
         whole["airl"] = _airl(layers, knob)
     return msgspec.structs.replace(listed, **whole)
@@ -195,7 +196,7 @@ def _airl(layers: Layers, knob: str | None = None) -> AIRLConfig:
     airl, transfer = _section("airl", layers, knob), _transfer(layers, knob)
     own = airl.get("challenger", {}).get("ppo", {})
     ppo = _merge(transfer.get("ppo", {}), own)
-    return msgspec.convert(_merge(airl, {"challenger": {"ppo": ppo}}), AIRLConfig)
+    return _as(AIRLConfig, _merge(airl, {"challenger": {"ppo": ppo}}))
 
 
 def _transfer(layers: Layers, knob: str | None = None) -> dict[str, Any]:
@@ -232,7 +233,7 @@ def overridden(items: Sequence[str]) -> dict[str, Any]:
             raise UsageError(f"{dotted} appears twice", "name each field once")
         tree = _merge(tree, _nest(dotted, value))
         values[dotted] = value
-    check_registered(msgspec.convert(tree, Config))
+    check_registered(_as(Config, tree))
     return values
 
 
@@ -248,17 +249,29 @@ def settings_directory() -> Path:
 
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with the values of ``over``; a field that ``over`` unsets is left out."""
+    """``base`` with the values of ``over``, UNSET included: it also unsets what is merged later."""
     merged = dict(base)
     for name, value in over.items():
         if isinstance(value, Mapping):
             inner = merged.get(name)
             merged[name] = _merge(inner if isinstance(inner, Mapping) else {}, value)
-        elif value is UNSET:
-            merged.pop(name, None)
         else:
             merged[name] = value
     return merged
+
+
+def _as(form: type[Form], tree: Mapping[str, Any]) -> Form:
+    """A merged ``tree`` as a ``form``."""
+    return msgspec.convert(_set_fields(tree), form)
+
+
+def _set_fields(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """``tree`` without the fields that are UNSET."""
+    return {
+        name: _set_fields(value) if isinstance(value, Mapping) else value
+        for name, value in tree.items()
+        if value is not UNSET
+    }
 
 
 def _nest(dotted: str, value: Any) -> dict[str, Any]:
@@ -271,7 +284,7 @@ def _convert(env: str, tree: Mapping[str, Any]) -> Config:
     for knob in tree.get("interventions", {}):
         knob_of(env, knob)
     try:
-        config = msgspec.convert(tree, Config)
+        config = _as(Config, tree)
     except msgspec.ValidationError as error:
         message, _, where = str(error).partition(" - at ")
         field = with_key(tree, Config, where.strip("`").removeprefix("$."))

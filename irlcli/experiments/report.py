@@ -15,7 +15,7 @@ from irlcli.experiments import facts
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import made_by
 from irlcli.experiments.status import source_in
-from irlcli.interventions import listed_settings
+from irlcli.interventions import listed_settings, without_cue
 from irlcli.report.parameters import ASSESS, CUE, Cell, Row
 from irlcli.stages import report, report_experts
 from irlcli.stages.base import Request, Source
@@ -151,7 +151,7 @@ def _rows(plan: Plan) -> list[Row]:
         )
         demos = plan.tasks[f"{plan.selection.tag}.{row}.demos"].request
         tree = msgspec.to_builtins(config) | {
-            "expert": msgspec.to_builtins(config.expert_of(unseen[0])),
+            "expert": msgspec.to_builtins(config.expert_of(without_cue(row.env, unseen[0]))),
             "airl": msgspec.to_builtins(config.airl_of(trained)),
             "transfer": msgspec.to_builtins(config.transfer_of(unseen[0])),
         }

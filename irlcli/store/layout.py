@@ -17,6 +17,7 @@ import re
 import shlex
 import stat
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,6 +143,9 @@ def create(layout: Layout) -> None:
         StageFailed: the root cannot be written, or its file system has no hard links.
     """
     if layout.marker.exists():
+        # Those that git did not keep; whoever may only read the store works without them.
+        with suppress(OSError):
+            make_directories(layout)
         return
     try:
         make_directories(layout)

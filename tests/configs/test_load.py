@@ -585,6 +585,19 @@ def test_none_in_a_settings_file_removes_what_the_profile_sets(toml):
     assert "'none'" in refused(files=[whole]).message
 
 
+def test_none_unsets_what_another_section_would_pass_on():
+    """Retrained policies learn as experts do, and challengers as retrained policies."""
+    inherited = load_config(LANDER, "paper").transfer.ppo
+    assert inherited.adam_eps == 1e-5
+    plain = load_config(LANDER, "paper", overrides=["transfer.ppo.adam_eps=none"])
+    assert plain.transfer.ppo == msgspec.structs.replace(inherited, adam_eps=msgspec.UNSET)
+    assert plain.expert.ppo.adam_eps == 1e-5
+    challenger = ["airl.challenger.ppo.adam_eps=none"]
+    found = load_config(LANDER, "paper", overrides=challenger)
+    assert found.airl.challenger.ppo.adam_eps is msgspec.UNSET
+    assert found.transfer.ppo.adam_eps == 1e-5
+
+
 def test_an_eps_that_is_the_default_is_no_other_key():
     plain = relevant_ppo(PPOConfig(), True, "expert.ppo")
     assert relevant_ppo(PPOConfig(adam_eps=1e-8), True, "expert.ppo") == plain

@@ -95,6 +95,18 @@ def test_jobs_that_cannot_be_cancelled_are_an_error(probe, tmp_path):
         Slurm(Resources()).cancel(["7"])
 
 
+def test_a_refused_job_does_not_keep_others_from_being_cancelled(probe, tmp_path):
+    probe(answer())
+    script = f"""#!/bin/sh
+for last; do :; done; echo "$last" >> {tmp_path}/cancelled
+case "$*" in 0*) echo 'error: Access denied' >&2; exit 1;; esac
+"""
+    (tmp_path / "scancel").write_text(script)
+    with pytest.raises(StageFailed, match="scancel: Access denied"):
+        Slurm(Resources()).cancel(map(str, range(501)))
+    assert (tmp_path / "cancelled").read_text().split() == ["499", "500"]
+
+
 def test_a_store_that_cannot_be_written(probe):
     with pytest.raises(StageFailed, match=r"cannot write to .*: No space left on device"):
         probe(answer(problem="No space left on device"))

@@ -254,3 +254,11 @@ def test_a_full_disk_is_collected(empty_store, family, monkeypatch):
 
     monkeypatch.setattr(os, "pwrite", full)
     assert len(empty_store.collect(DAY)[0]) == len(family)
+
+
+def test_a_store_that_git_cloned_is_protected_from_the_first_command_on(empty_store):
+    """git keeps no empty directories, so the one with the locks is missing."""
+    shutil.rmtree(empty_store.root / ".locks")
+    empty_store.create()
+    with empty_store.in_use(), pytest.raises(Busy):
+        Store(empty_store.root).collect(0)

@@ -13,7 +13,8 @@ SPEC = EnvironmentSpec(
         "leg-length": LEG_LENGTH._replace(
             forms=("absolute", "multiplier"), description="length of both legs"
         ),
-        # On the way to the goal: the last step went forward, at half a metre per second or more.
+        # On the way to the goal: the last step's reward, its speed forward minus the cost of control,
+        # was above 0.5.
         "cue-strength": cue_knob(Cue("friction=1.5:0.1:0.1", window=1, bar=0.5)),
     },
     needs=PYBULLET,

@@ -136,13 +136,14 @@ class Slurm:
             StageFailed: Slurm refused to cancel some, for example those of other people.
         """
         listed = list(ids)
-        for start in range(0, len(listed), 500):
-            done = _say("scancel", *listed[start : start + 500])
-            if done.returncode != 0:
-                raise StageFailed(
-                    f"scancel: {_reason(done.stderr)}",
-                    "the other jobs are cancelled; whoever submitted a job can cancel it",
-                )
+        batches = [listed[start : start + 500] for start in range(0, len(listed), 500)]
+        answers = [_say("scancel", *batch) for batch in batches]
+        refused = [_reason(answer.stderr) for answer in answers if answer.returncode != 0]
+        if refused:
+            raise StageFailed(
+                f"scancel: {refused[0]}",
+                "the other jobs are cancelled; whoever submitted a job can cancel it",
+            )
 
     def probe(self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]) -> None:
         """Run a job that looks at the store from a node, and wait for it.
