@@ -121,7 +121,11 @@ def unseen(config: CuedMapsConfig, fitted: Fitted, seeds: Sequence[int], colours
 def held_out_risk(
     config: CuedMapsConfig, data: Dataset, setting: int, fitted: Fitted
 ) -> np.ndarray:
-    """Negative log-likelihood of one setting's demonstrations [V, S], in nats per episode."""
+    """Negative log-likelihood of one setting's demonstrations [V, S], in nats per episode.
+
+    As in the risk that is minimised, the first states are in expectation, not those of the
+    demonstrations.
+    """
     settings = torus(config.size, 1)
     kinds = data.maps.kinds[:, setting]
     visits = np.stack([d.states[setting] for d in data.demos])

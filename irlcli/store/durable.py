@@ -12,6 +12,11 @@ from pathlib import Path
 _DAY_SECONDS = 86400.0
 
 
+def open_plainly(path: str, flags: int) -> int:
+    """An opener that follows no link and does not wait for a pipe's other end."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
+
+
 def fsync_file(path: Path) -> None:
     """Make a file's content durable."""
     with open(path, "rb") as file:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import Busy
-from irlcli.store.durable import alive, machine, remove, unique_name
+from irlcli.store.durable import alive, machine, open_plainly, remove, unique_name
 
 HEARTBEAT_SECONDS = 20.0
 # NFS clients may show times that are 60 s old, so a live lease can look 80 s old.
@@ -146,7 +146,7 @@ def read(path: Path) -> Holder | None:
     """The holder of a lease; None if nobody holds it."""
     try:
         # Opened and not only looked up, so that a file system of the network asks its server.
-        with open(path, "rb", opener=_open) as file:
+        with open(path, "rb", opener=open_plainly) as file:
             touched = os.fstat(file.fileno()).st_mtime
             text = file.read(1000)
     except FileNotFoundError:
@@ -166,10 +166,6 @@ def read(path: Path) -> Holder | None:
 def _token(path: Path) -> str | None:
     holder = read(path)
     return None if holder is None else holder.token
-
-
-def _open(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def _now(directory: Path) -> float:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.store.digest import digest, file_digest, is_hexadecimal
+from irlcli.store.durable import open_plainly
 
 SCHEMA = 1
 MANIFEST = "manifest.json"
@@ -129,7 +130,7 @@ def _read(path: Path) -> bytes:
         IntegrityError: missing, not a regular file, too large, or unreadable.
     """
     try:
-        with open(path, "rb", buffering=0, opener=_open_plainly) as file:
+        with open(path, "rb", buffering=0, opener=open_plainly) as file:
             information = os.fstat(file.fileno())
             if not stat.S_ISREG(information.st_mode):
                 raise IntegrityError(f"{path} is missing or not a regular file")
@@ -140,11 +141,6 @@ def _read(path: Path) -> bytes:
         if error.errno in _NO_FILE:
             raise IntegrityError(f"{path} is missing or not a regular file") from None
         raise IntegrityError(f"{path} cannot be read ({error.strerror})") from None
-
-
-def _open_plainly(path: str, flags: int) -> int:
-    # Without following a link or waiting for a pipe's other end.
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def _parse_json(path: Path, data: bytes) -> Any:
