@@ -70,9 +70,9 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
 
 
 def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -> list[str]:
-    """Experts that earn no more than the random agent, against which no verdict means anything.
+    """Experts that earn no more than the random agent, or less than the training experts.
 
-    A table without a measure in the held-out setting says nothing about its expert.
+    Against the former no verdict means anything. A table without a measure in the held-out setting says nothing about its expert.
     """
     weak: dict[tuple[str, str], None] = {}
     for (assessed, _, _), assessment in assessments.items():
@@ -82,11 +82,19 @@ def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -
         expert, random = (means.get((row.name, agent)) for agent in ("expert", "random"))
         if expert is not None and random is not None and expert <= random:
             weak[row.name, row.unseen] = None
-    return [
+    found = [
         f"Weak expert: {name}: in {setting} the expert earns no more than the random agent. Shares of "
         "the expert and verdicts mean nothing there."
         for name, setting in weak
     ]
+    for row in p.rows if has_held_out(p.measures) else ():
+        expert, reused = (means.get((row.name, agent)) for agent in ("expert", "reused"))
+        if expert is not None and reused is not None and reused > expert:
+            found.append(
+                f"Weak expert: {row.name}: the training experts earn {reused:.1f} in {row.unseen}, its own "
+                f"expert {expert:.1f}, so that is not the best policy known there."
+            )
+    return found
 
 
 def below_bar(p: Parameters, points: pd.DataFrame) -> list[str]:

@@ -33,12 +33,19 @@ def test_a_student_that_did_not_imitate():
 def test_an_expert_no_better_than_the_random_agent(expert, weak):
     returns = complete() | {(BOUNCE, "random", "ood"): [100.0], (BOUNCE, "expert", "ood"): [expert]}
     found = build(*example(returns), {}, {}).caveats
-    assert any(c.startswith(f"Weak expert: {BOUNCE}: ") for c in found) == weak
+    assert any(c.startswith(f"Weak expert: {BOUNCE}: in bounce=0.9") for c in found) == weak
     assert not any(c.startswith(f"Weak expert: {POWER}: ") for c in found)
     # A table of the training settings says nothing about the held-out one.
     p, points = example(returns)
     seen = build(replace(p, measures=("id",)), points, {}, {}).caveats
     assert not any(c.startswith("Weak expert") for c in seen)
+
+
+@pytest.mark.parametrize(("expert", "weak"), [(109.0, True), (110.0, False)])
+def test_an_expert_below_the_training_experts_is_named(expert, weak):
+    returns = complete() | {(BOUNCE, "expert", "ood"): [expert]}
+    found = build(*example(returns), {}, {}).caveats
+    assert any("training experts earn 110.0 in bounce=0.9" in c for c in found) == weak
 
 
 @pytest.mark.parametrize(("bar", "low"), [(None, False), (250.0, False), (251.0, True)])
