@@ -111,9 +111,11 @@ def _difference(found: KeyRecord, sought: KeyRecord) -> str:
         return f"version {found.stage_version} of the stage instead of {sought.stage_version}"
     here, there = dict(flat(found.parameters)), dict(flat(sought.parameters))
     names = _differing(found, sought)
-    parts = [f"{n} {here.get(n, 'unset')} instead of {there.get(n, 'unset')}" for n in names]
-    if not parts:
-        return "other inputs"
+    roles = sorted(found.inputs.keys() | sought.inputs.keys())
+    others = [role for role in roles if found.inputs.get(role) != sought.inputs.get(role)]
+    # Inputs first: parameters may be many.
+    parts = [f"another input ({', '.join(others)})"] if others else []
+    parts += [f"{n} {here.get(n, 'unset')} instead of {there.get(n, 'unset')}" for n in names]
     return ", ".join(parts[:4]) + (f" and {len(parts) - 4} more" if len(parts) > 4 else "")
 
 

@@ -302,6 +302,20 @@ def test_other_evaluations_are_left_out_too(report, irl, table_store, tmp_path):
     assert left_out.endswith("evaluation.episodes 3 instead of 2.")
 
 
+def test_rewards_from_other_demonstrations_are_left_out_as_such(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    more = ["--store", copy, "--profile", "smoke", "--quiet"]
+    # The demonstrations of the table have two episodes.
+    again = ["collect-experts", "--env", "lunar-lander", "--intervention", "engine-power=1x,1.25x"]
+    assert irl(*again, "--episodes", "3", *more, "--name", "others").code == 0
+    learn = ["train-airl", "--demos", "others", "--method", "irm", "--seed", "0"]
+    assert irl(*learn, *more, *SMALL).code == 0
+    notes = [n for n in caveats(report("table1", copy, *ROW)) if n.startswith("Left out")]
+    (reward,) = (note for note in notes if "train-airl" in note)
+    assert "another input (demonstrations)" in reward
+
+
 def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path):
     copy = tmp_path / "runs"
     shutil.copytree(table_store, copy, symlinks=True)
