@@ -13,7 +13,7 @@ PPO: rl-baselines3-zoo, ``hyperparams/ppo.yml``, LunarLander-v2 and HalfCheetahB
 imitation wants episodes of equal length and names absorbing states as the way there, by a wrapper of
 seals, which it requires. So LunarLander's episodes last 1000 steps here, and demonstrated episodes end
 with their last observation and action repeated. ``variable`` instead passes
-``allow_variable_horizon``, as most users' scripts do.
+``allow_variable_horizon``.
 
 Its learners take worlds of one kind: they get equal shares of the worlds of all settings, and the
 pooled demonstrations, which is ERM. Nothing is logged, and all worlds are stepped in one process.
