@@ -19,6 +19,8 @@ EvaluationRun = tuple[Evaluation, Mapping[str, Any], bool]
 _Group = tuple[int, str, str, str]
 _ORDER = get_args(Agent)
 _MOST_DIFFERENCES = 3
+# As :func:`irlcli.experiments.circumstances.circumstances` names it.
+_OTHER_REWARD = "reward."
 _SHA256 = re.compile("[0-9a-f]{64}")
 
 
@@ -120,8 +122,13 @@ def _value(run: _Run, name: str) -> str:
 
 
 def _field(name: str) -> str:
-    """``train-airl.airl.penalty_weight`` as ``--set`` names it: ``airl.penalty_weight``."""
-    return name.partition(".")[2] if name.count(".") > 1 else name
+    """``train-airl.airl.penalty_weight`` as ``--set`` names it: ``airl.penalty_weight``.
+
+    With ``reward.`` before it where it is of another reward than the policy's own.
+    """
+    of = name.removeprefix(_OTHER_REWARD)
+    field = of.partition(".")[2] if of.count(".") > 1 else of
+    return _OTHER_REWARD + field if of != name else field
 
 
 def _row(agent: str, env: str, setting: str, runs: Sequence[_Run]) -> AgentRow:
