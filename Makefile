@@ -111,15 +111,15 @@ bench: $(READY)
 	$(VENV)/bin/python -m benchmarks.parallel
 	$(VENV)/bin/python -m benchmarks.growth
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m benchmarks.maxent
-	$(VENV)/bin/python -m benchmarks.startup
 	$(VENV)/bin/python -m benchmarks.idle
 	$(VENV)/bin/python -m benchmarks.workers
 	$(VENV)/bin/python -m benchmarks.mujoco_threads
 	$(VENV)/bin/python -m benchmarks.data
 	$(VENV)/bin/python -m benchmarks.sharing
 	$(VENV)/bin/python -m benchmarks.cluster
-	@if command -v valgrind > /dev/null; then $(VENV)/bin/python -m benchmarks.robot_step; \
-	else echo "skipped benchmarks.robot_step: it counts instructions with valgrind"; fi
+	@if command -v valgrind > /dev/null; \
+	then $(VENV)/bin/python -m benchmarks.startup && $(VENV)/bin/python -m benchmarks.robot_step; \
+	else echo "skipped benchmarks.startup and benchmarks.robot_step: they need valgrind"; fi
 
 # An environment of its own for imitation, whose dependencies are older than ours. Finished runs are kept.
 PEERS       ?= .venv-peers

@@ -1,6 +1,6 @@
 """Instructions that one step of each robot executes, counted by callgrind.
 
-    python benchmarks/robot_step.py [ant half-cheetah-bullet mujoco-Ant mujoco-Ant-gymnasium ...]
+    python -m benchmarks.robot_step [ant half-cheetah-bullet mujoco-Ant mujoco-Ant-gymnasium ...]
 
 Counts are the difference of two run lengths, so start-up, reset and imports cancel, and they
 do not depend on what else the machine is doing. Needs ``valgrind`` on the path. Actions are
@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
-import subprocess
 import sys
-import tempfile
 
 import numpy as np
+
+from benchmarks.startup import counted
 
 SHORT, LONG = 200, 500
 # Callgrind counts `rep movsb` and `rep stosb`, with which glibc copies and fills large blocks, once
@@ -70,32 +69,10 @@ def roll_out(name: str, steps: int) -> None:
 
 def instructions(name: str, steps: int) -> int:
     """Instructions of a whole process that takes ``steps`` steps."""
-    with tempfile.NamedTemporaryFile() as out:
-        done = subprocess.run(
-            [
-                "valgrind",
-                "--tool=callgrind",
-                f"--callgrind-out-file={out.name}",
-                sys.executable,
-                __file__,
-                "--roll-out",
-                name,
-                str(steps),
-            ],
-            capture_output=True,
-            text=True,
-            env={
-                **os.environ,
-                "PYTHONHASHSEED": "0",
-                "OMP_NUM_THREADS": "1",
-                "GLIBC_TUNABLES": NO_REP,
-            },
-            check=True,
-        )
-    match = re.search(r"Collected : (\d+)", done.stderr)
-    if match is None:
-        raise RuntimeError(f"callgrind printed no count:\n{done.stderr}")
-    return int(match.group(1))
+    return counted(
+        ["-m", "benchmarks.robot_step", "--roll-out", name, str(steps)],
+        {**os.environ, "OMP_NUM_THREADS": "1", "GLIBC_TUNABLES": NO_REP},
+    )
 
 
 def main(names: list[str]) -> None:

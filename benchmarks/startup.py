@@ -15,6 +15,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 
 BUDGET = 1.5
 HIT = [
@@ -55,17 +56,21 @@ def instructions(code: str) -> int:
     The first time it may compile modules, and compute what is then a hit.
     """
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    environment["PYTHONHASHSEED"] = "0"
-    python = [sys.executable, "-c", code]
-    subprocess.run(python, check=True, capture_output=True, env=environment)
-    counted = subprocess.run(
-        ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", *python],
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
+    return counted(["-c", code], environment)
+
+
+def counted(arguments: Sequence[str], environment: Mapping[str, str]) -> int:
+    """Instructions of ``python ARGUMENTS``, counted by callgrind."""
+    callgrind = ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null"]
+    done = subprocess.run(
+        [*callgrind, sys.executable, *arguments],
         check=True,
         capture_output=True,
         text=True,
-        env=environment,
+        env={**environment, "PYTHONHASHSEED": "0"},
     )
-    (count,) = re.findall(r"Collected : (\d+)", counted.stderr)
+    (count,) = re.findall(r"Collected : (\d+)", done.stderr)
     return int(count)
 
 

@@ -116,7 +116,7 @@ def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) 
             raise UsageError(
                 f"{env} {setting} and {', '.join(trained)} have different observations: the first "
                 f"are {_observations(added(setting))}, the second {_observations(learned)}",
-                f"name a setting of {', '.join(fit)}",
+                f"name a setting of {', '.join(fit)}" if fit else "name the setting default",
             )
 
 

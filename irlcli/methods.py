@@ -74,14 +74,12 @@ def method(name: str) -> Method:
 def fields(name: str, section: str) -> dict[str, Any]:
     """The config fields that ``--method NAME`` sets in ``section``: ``airl`` or ``maxent``.
 
-    Behavioural cloning reads none of them.
-
     Raises:
         UsageError: there is no such method.
     """
     chosen = method(name)
     values = {"grouping": chosen.grouping, "penalty": chosen.penalty}
-    if section == "airl" and chosen.learns_reward:
+    if section == "airl":
         values |= {"learner": chosen.learner, **chosen.sets}
     return {f"{section}.{field}": value for field, value in values.items()}
 

@@ -110,18 +110,18 @@ class LearnedReward:
         from gymnasium.spaces import Discrete, MultiDiscrete
         from gymnasium.spaces.utils import flatdim
 
-        observed, acted = flatdim(observation_space), flatdim(action_space)
+        from irlcli.learners.frozen import actions_in_words
+
+        choices: tuple[int, ...] = ()
+        if isinstance(action_space, MultiDiscrete):
+            choices = tuple(action_space.nvec.ravel().tolist())
         discrete = isinstance(action_space, Discrete | MultiDiscrete)
-        if (observed, acted, discrete) != (
-            self.observation_size,
-            self.action_size,
-            self.discrete,
-        ):
-            kinds = ("continuous", "discrete")
+        observed, theirs = flatdim(observation_space), (discrete, flatdim(action_space), choices)
+        ours = (self.discrete, self.action_size, self.choices)
+        if (observed, theirs) != (self.observation_size, ours):
             raise ValueError(
-                f"the environment has observations of size {observed} and {kinds[discrete]} actions of "
-                f"size {acted}, the reward takes {self.observation_size} and {kinds[self.discrete]} "
-                f"{self.action_size}"
+                f"the environment has observations of size {observed} and {actions_in_words(*theirs)}, "
+                f"the reward takes {self.observation_size} and {actions_in_words(*ours)}"
             )
 
     def module(self) -> StandaloneReward:
@@ -160,7 +160,7 @@ def load_reward(
         env: TOML file of the environment, for a ``reward.pt`` outside a store that was learned in
             an environment of one's own.
         setting: the setting it is to be used in, e.g. ``friction=1.5:0.1:0.1``; by default the
-            first one it was learned in. Only the goal of a setting changes an observation's size.
+            first one it was learned in. A goal or a cue in it changes an observation's size.
         gamma: discount of the policy that is trained on it, for the value of an absorbing state
             (a reward learned with ``airl.fixed_horizon``): from 0 to less than 1. By default
             ``airl.ppo.gamma`` of its config.
@@ -173,8 +173,8 @@ def load_reward(
     from irlcli.data.tensors import load_reward_file
     from irlcli.envs.registry import resolve
     from irlcli.errors import UsageError
+    from irlcli.experiments.inputs import checked
     from irlcli.experiments.references import tensor_file
-    from irlcli.experiments.status import checked
     from irlcli.stages.base import environment_key
     from irlcli.stages.running import frozen_reward
 
@@ -188,7 +188,7 @@ def load_reward(
     if env is not None:
         resolve(env)
     opened = Store(Path(store))
-    source, description = tensor_file(opened, str(ref), "reward")
+    source, _ = tensor_file(opened, str(ref), "reward")
     model, description = load_reward_file(checked(opened, source))
     where = environment_key(description.env)
     frozen = frozen_reward(

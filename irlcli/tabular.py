@@ -163,6 +163,8 @@ def backward(
     """Value iteration over a finite horizon: V_H = r, Q_t = E[V_{t+1}], V_t = r + max_a Q_t.
 
     A trajectory is s_0, a_0, ..., s_H: H actions, and a reward for each of its H + 1 states.
+    ``Evaluation.true_return`` leaves out the last reward, so near a tight horizon another policy may
+    have a slightly higher true return.
 
     Args:
         reward: [R, S], the same reward in every setting, or [R, E, S].
@@ -228,30 +230,6 @@ def evaluate(settings: StackedMDPs, policy: np.ndarray) -> Evaluation:
     reward = np.stack([m.reward for m in settings.mdps])
     true_return = ((occupancy - last) * reward).sum(-1)
     return Evaluation(np.clip(reached, 0.0, 1.0), true_return)
-
-
-def optimal_policy(
-    settings: StackedMDPs, reward: np.ndarray, horizon: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Value iteration over ``horizon`` steps: policy [H, A, E, S, R], uniform over ties, and V_0.
-
-    It plans for the H + 1 rewards that a demonstration has. ``Evaluation.true_return`` leaves out the
-    last one, so near a tight horizon another policy may have a slightly higher true return.
-
-    Raises:
-        ValueError: as :func:`backward`; or the goal of a setting cannot be reached, at all or
-            within the horizon.
-    """
-    for e, mdp in enumerate(settings.mdps):
-        try:
-            needed = shortest_path_length(mdp)
-        except ValueError as error:
-            raise ValueError(f"setting {e}: {error}") from None
-        if needed > horizon:
-            raise ValueError(
-                f"setting {e}: the goal is {needed} steps away, the horizon only {horizon}"
-            )
-    return backward(settings, reward, horizon)
 
 
 def intended_path(mdp: TabularMDP, policy: np.ndarray) -> np.ndarray:

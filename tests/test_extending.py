@@ -11,8 +11,8 @@ import pytest
 
 from irlcli import learners, penalties, rl
 from irlcli.envs import registry
+from irlcli.experiments.references import demonstrations
 from irlcli.experiments.runner import Runner
-from irlcli.experiments.status import source_of
 from irlcli.stages.base import From
 from irlcli.store import Store
 
@@ -181,12 +181,11 @@ def test_a_stage(lab, store_copy):
     from lab import count_steps
 
     runner = Runner(store_copy.path)
-    resolved = runner.store.resolve("demos")
-    demos, source = resolved.artefact, source_of(resolved)
+    source, _, _ = demonstrations(runner.store, "demos")
     first, again = (runner.run(count_steps.request(source)) for _ in range(2))
     assert first.id == again.id
     steps = int((first.directory / "steps.txt").read_text())
     import pyarrow.parquet as pq
 
-    assert steps == pq.read_table(demos.directory / "steps.parquet").num_rows
+    assert steps == pq.read_table(source.path / "steps.parquet").num_rows
     assert isinstance(From(count_steps.request(source)).request.parameters, object)

@@ -290,11 +290,35 @@ def test_an_environment_of_other_spaces_is_refused_before_its_first_step(tmp_pat
     path, _ = write_random_reward(tmp_path, "half-cheetah", fixed_horizon=False)
     reward = irlcli.load_reward(path)
     make = lambda: gymnasium.make("irlcli/LunarLander-v0")  # noqa: E731
-    message = "observations of size 8 and discrete actions of size 4, the reward takes 17"
+    message = (
+        "observations of size 8 and 4 discrete actions, the reward takes 17 and actions of size 6"
+    )
     with pytest.raises(ValueError, match=message):
         irlcli.RewardWrapper(make(), reward)
     with pytest.raises(ValueError, match=message):
         irlcli.RewardVecEnvWrapper(DummyVecEnv([make]), reward)
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        (gymnasium.spaces.MultiDiscrete([3, 2]), None),
+        (gymnasium.spaces.MultiDiscrete([2, 3]), "discrete actions of 2 x 3 choices"),
+        (gymnasium.spaces.Discrete(5), "5 discrete actions"),
+        (gymnasium.spaces.Box(-1, 1, (5,)), "actions of size 5"),
+    ],
+)
+def test_several_choices_are_compared_one_by_one(actions, words):
+    """Each of these spaces flattens to size 5."""
+    network = SimpleNamespace(observation_size=4, action_size=5, discrete=True, choices=(3, 2))
+    about = SimpleNamespace(env="x", settings=(), method="erm", seed=0, network=network)
+    check = irlcli.rewards.LearnedReward(None, about).check_spaces
+    observations = gymnasium.spaces.Box(-1, 1, (4,))
+    if words is None:
+        check(observations, actions)
+        return
+    with pytest.raises(ValueError, match=words):
+        check(observations, actions)
 
 
 # The file

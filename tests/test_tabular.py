@@ -15,7 +15,6 @@ from irlcli.tabular import (
     evaluate,
     forward,
     intended_path,
-    optimal_policy,
     shortest_path_length,
     stack,
     true_reward,
@@ -72,7 +71,7 @@ def test_a_reward_per_setting_and_runs_together_equal_each_alone():
 @pytest.mark.parametrize("goal", ["terminal", "absorbing"])
 def test_evaluation_is_the_same_whether_the_goal_ends_or_absorbs(goal):
     settings = stack([gridworld(4, goal=goal)])
-    policy, _ = optimal_policy(settings, true_reward(settings), 7)
+    policy, _ = backward(settings, true_reward(settings), 7)
     result = evaluate(settings, policy)
     dense = dense_transitions(gridworld(4, goal="absorbing"))
     state, paid = settings.start[0], 0.0
@@ -115,8 +114,6 @@ def test_an_unreachable_goal_is_refused():
     stuck = dataclasses.replace(mdp, successor=np.zeros_like(mdp.successor), start=np.eye(7)[0])
     with pytest.raises(ValueError, match="cannot be reached"):
         shortest_path_length(stuck)
-    with pytest.raises(ValueError, match="setting 1: the goal cannot be reached"):
-        optimal_policy(stack([mdp, stuck]), np.zeros((1, 7)), 5)
 
 
 def test_bad_arguments_of_the_solver_are_refused():

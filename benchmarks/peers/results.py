@@ -170,6 +170,7 @@ def _provenance(runs: Sequence[Run]) -> str:
     }
     lines = [
         f"- Commit: {listed(_of_commit(run.about['commit'], runs) for run in runs)}",
+        f"- Demonstrations: {listed(run.about['demonstrations'] for run in runs)}",
         f"- Limit: {listed(_number(run.about['limit']) for run in runs)} CPU seconds a run",
         f"- Machine: {listed(run.about['machine'] for run in runs)}",
         f"- `irlcli`: {versions['ours'] or 'not run'}",

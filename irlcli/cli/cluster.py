@@ -120,9 +120,7 @@ class ClusterOptions(NamedTuple):
             parse_minutes(self.time)
         _sbatch_options(self.sbatch)
         if asks and dry_run:
-            raise UsageError(
-                "--dry-run shows the plan, not the jobs", "omit --dry-run, or --status and --cancel"
-            )
+            raise UsageError("--dry-run shows the plan, not the jobs", f"omit --dry-run or {asks}")
 
 
 def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
@@ -205,7 +203,7 @@ def run_jobs(
     session: StageSession,
     runner: "Runner",
     plan: "Plan",
-    words: Callable[[str], list[str]],
+    step_command: Callable[[str], list[str]],
     options: ClusterOptions,
 ) -> "Outcome | None":
     """Submit what is missing and wait for it; None with ``--detach``."""
@@ -220,20 +218,16 @@ def run_jobs(
     # A job that waits for another process would hold its node idle: it exits and is requeued.
     impatient = ["--no-wait"] if session.wait and queue.starts_what_waits else []
 
-    def command(name: str) -> list[str]:
-        return [sys.executable, "-P", "-m", "irlcli", *words(name), *impatient]
-
     display = job_display(session.console)
     requeues = DEFAULT_REQUEUES if queue.starts_what_waits else LOCAL_REQUEUES
     if options.requeues is not None:
         requeues = options.requeues
-    job = JobCommand(command, Path.cwd(), requeues, options.jobs or 1)
+    job = JobCommand(
+        lambda name: [*step_command(name), *impatient], Path.cwd(), requeues, options.jobs or 1
+    )
     submission = Submission(plan, runner, queue, job, display)
     try:
-        count = submission.submit(
-            lambda: session.console.say("a probe job checks the store from a node"),
-            session.console.warn,
-        )
+        count = submission.submit()
         if count:
             session.console.say(f"{out.counted(count, 'job')} submitted")
         if options.detach:

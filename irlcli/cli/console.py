@@ -63,12 +63,8 @@ class TerminalConsole:
         self._writer: Any = None
         if tensorboard is not None:
             _require_tensorboard()
-        self._rich = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
-
-    @property
-    def is_live(self) -> bool:
-        """Whether a live display can be drawn."""
-        return self._rich
+        #: Whether a live display can be drawn.
+        self.is_live = sys.stderr.isatty() and os.environ.get("TERM") != "dumb" and not quiet
 
     def share(self, live: Any) -> None:
         """Print above another live display; None when that display has ended."""
@@ -85,7 +81,7 @@ class TerminalConsole:
         """Progress of the running stage."""
         detail = self._pace.words(done, total, unit, facts)
         now = time.monotonic()
-        if self._rich:
+        if self.is_live:
             self._draw(done, total, detail)
         elif now - self._printed >= _PLAIN_SECONDS or done >= total:
             self._printed = now

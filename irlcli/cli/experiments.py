@@ -52,6 +52,8 @@ TableFile = Annotated[
     typer.Option("--experiments", help="File with the tables. Default: settings/experiments.toml."),
 ]
 
+# -P: as for the script `irl`, the working directory is not on Python's path.
+_PROCESS = (sys.executable, "-P", "-m", "irlcli")
 _JOBS = "Jobs of a cluster"
 _CONTINUE = "run the same command again to continue"
 _JOBS_GO_ON = (
@@ -93,10 +95,9 @@ def plan(
         return
     from irlcli.experiments.snakemake import snakefile
 
-    command = _child_words(session, choice, plan)
     needs = {name: plan.needs[name] for name in plan.tasks}
     line = shlex.join(["irl", *sys.argv[1:]])
-    out.print_data(snakefile(needs, lambda name: ["irl", *command(name)], line).rstrip())
+    out.print_data(snakefile(needs, _step_command(session, choice, plan, "irl"), line).rstrip())
 
 
 def _print_plan(session: StageSession, choice: TableChoice, plan: "Plan") -> None:
@@ -105,9 +106,9 @@ def _print_plan(session: StageSession, choice: TableChoice, plan: "Plan") -> Non
     steps = steps_of(plan)
     counts = {status: sum(s["status"] == status for s in steps) for status in STATUSES}
     if session.as_json:
-        command = _child_words(session, choice, plan)
+        command = _step_command(session, choice, plan, "irl")
         for step in steps:
-            step["command"] = ["irl", *command(step["name"])]
+            step["command"] = command(step["name"])
         out.print_json("plan", {"table": choice.table, "counts": counts, "steps": steps})
         return
     for step in steps:
@@ -235,8 +236,8 @@ def run(
         if cluster is None:
             outcome = _make_all(session, runner, plan, choice, jobs or 1)
         else:
-            words = _child_words(session, choice, plan)
-            ended = cluster_jobs.run_jobs(session, runner, plan, words, options)
+            command = _step_command(session, choice, plan, *_PROCESS)
+            ended = cluster_jobs.run_jobs(session, runner, plan, command, options)
             if ended is None:
                 return
             outcome = ended
@@ -271,30 +272,21 @@ def _make_all(
     from irlcli.cli.jobs import job_display
     from irlcli.experiments.execute import Execution
 
-    words = _child_words(session, choice, plan)
+    command = _step_command(session, choice, plan, *_PROCESS)
     display = job_display(session.console)
-
-    def command(name: str) -> list[str]:
-        # -P: as for the script `irl`, the working directory is not on Python's path.
-        return [sys.executable, "-P", "-m", "irlcli", *words(name)]
-
     try:
         return Execution(plan, runner, command, jobs, display).run()
     finally:
         display.close()
 
 
-def _child_words(
-    session: StageSession, choice: TableChoice, plan: "Plan"
+def _step_command(
+    session: StageSession, choice: TableChoice, plan: "Plan", *program: str
 ) -> Callable[[str], list[str]]:
-    """The command line that makes one step, by its name."""
+    """The command line by which ``program`` makes one step, by its name."""
     words = [*session.config_words(), *choice.words(), "--tag", plan.selection.tag]
     words += session.place_words()
-
-    def command(name: str) -> list[str]:
-        return ["run", choice.table, "--only", name, *words]
-
-    return command
+    return lambda name: [*program, "run", choice.table, "--only", name, *words]
 
 
 def _report(

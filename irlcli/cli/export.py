@@ -14,8 +14,8 @@ from irlcli.cli.session import Session
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
+from irlcli.experiments.inputs import checked
 from irlcli.experiments.recordings import minari_directory
-from irlcli.experiments.status import checked
 
 
 @store_command

@@ -68,18 +68,12 @@ def _main() -> None:
     except BrokenPipeError:
         console.hang_up()
     except OSError as error:
-        if _debugging():
-            raise
         _fail(file_failure(error))
     except ModuleNotFoundError as error:
-        if _debugging():
-            raise
         _fail(StageFailed(str(error), "install its package, or name its folder in PYTHONPATH"))
     except Exception as error:
         if hasattr(error, "format_message"):
             _fail(_usage(error))
-        if _debugging():
-            raise
         _fail(
             StageFailed(
                 f"unexpected {described(error)}",

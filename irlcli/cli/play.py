@@ -12,7 +12,7 @@ from irlcli.cli.session import Session
 from irlcli.configs import load_config
 from irlcli.errors import UsageError
 from irlcli.experiments import references
-from irlcli.experiments.status import checked
+from irlcli.experiments.inputs import checked
 from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.requests import arguments
 from irlcli.stages.base import Source

@@ -111,7 +111,9 @@ def print_report(session: StageSession, artefact: Artefact) -> None:
     _warn_of_versions(session, artefact)
     report = report_json(session, artefact)
     if report is None:
-        out.print_note(session.store.open(artefact, "README.md").read_text().rstrip())
+        out.print_note(
+            session.store.open(artefact, "README.md").read_text(encoding="utf-8").rstrip()
+        )
         return
     shown = [table for table in report["tables"] if table["title"] != EVERY_CELL]
     for table in shown:

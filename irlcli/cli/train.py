@@ -78,6 +78,7 @@ def train_airl(
         state_only=state_only,
         env=env,
         seed=seed,
+        name=name,
     )
     if request is not None:
         session.deliver([request], name)

@@ -106,7 +106,8 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     """``airl`` with every field reset that its method, replay, selection and actions do not use.
 
     Raises:
-        UsageError: an unknown learner or penalty, or an option that does not fit the actions.
+        UsageError: an unknown learner or penalty, options that contradict each other or do not fit the
+            actions; or as :func:`relevant_ppo`.
     """
     _check_known("airl.learner", airl.learner, LEARNERS)
     check_penalty(airl.penalty, "airl")
@@ -247,7 +248,7 @@ def relevant_transfer(
 
     Raises:
         UsageError: an unknown algorithm, or one or an option that does not fit the actions or the
-            start, or SAC whose budget ends before its first update.
+            start, restarts longer than the budget, or SAC whose budget ends before its first update.
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
     if from_student or transfer.restarts in (UNSET, 1):

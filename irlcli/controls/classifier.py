@@ -14,11 +14,14 @@ import torch
 from torch.nn.functional import dropout
 
 from irlcli.controls.variants import Method
-from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
+from irlcli.penalties import (
+    PENALTIES,
+    PenaltyOptions,
+    Samples,
+    discriminator_penalty,
+    loss_divisor,
+)
 from irlcli.penalties.risk import cross_entropy
-
-# Penalties that add up: computed for all runs at once, they are the sum of each run's.
-_ADDITIVE = ("iga", "input-gradient", "l2")
 
 
 class Schedule(NamedTuple):
@@ -118,7 +121,7 @@ def _penalty(
     """The sum of the R runs' penalties, a scalar."""
     penalty = discriminator_penalty(name)
     weights = torch.full((risks.shape[1],), 1.0 / risks.shape[1])
-    if name in _ADDITIVE:
+    if PENALTIES[name].additive:
         parameters = tuple(networks.parameters())
 
         def input_gradient() -> torch.Tensor:
@@ -132,7 +135,9 @@ def _penalty(
         return penalty(seen, options)
 
     def of_one(own: torch.Tensor, entropies: torch.Tensor) -> torch.Tensor:
-        return penalty(Samples(own, own, entropies, weights), options)
+        # A penalty that is not registered as additive must fail here, not find no weights.
+        seen = Samples(own, own, entropies, weights, parameters=None)  # type: ignore[arg-type]
+        return penalty(seen, options)
 
     return torch.func.vmap(of_one)(logits, risks).sum()
 

@@ -68,7 +68,7 @@ def action_type(actions: np.ndarray) -> pa.DataType:
     return number if actions.ndim == 1 else pa.list_(number, actions.shape[1])
 
 
-def steps_schema(observation_size: int, action: pa.DataType, rewarded: bool = True) -> pa.Schema:
+def steps_schema(observation_size: int, action: pa.DataType, rewarded: bool) -> pa.Schema:
     """The columns of ``steps.parquet``."""
     return table_schema(
         episode=pa.int32(),
@@ -80,7 +80,7 @@ def steps_schema(observation_size: int, action: pa.DataType, rewarded: bool = Tr
 
 
 def episodes_schema(
-    observation_size: int, setting: pa.DataType | None = None, rewarded: bool = True
+    observation_size: int, setting: pa.DataType | None = None, *, rewarded: bool
 ) -> pa.Schema:
     """The columns of ``episodes.parquet``."""
     return table_schema(
@@ -184,7 +184,7 @@ def _check_schemas(steps: pa.Schema, episodes: pa.Schema) -> None:
     setting = pa.dictionary(pa.int32(), pa.string())
     for found, expected in (
         (steps, steps_schema(obs.list_size, action, rewarded)),
-        (episodes, episodes_schema(obs.list_size, setting, rewarded)),
+        (episodes, episodes_schema(obs.list_size, setting, rewarded=rewarded)),
     ):
         if not found.equals(expected, check_metadata=False):
             raise ValueError("its columns are not those of demonstrations")

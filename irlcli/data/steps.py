@@ -63,6 +63,15 @@ class Steps:
         start = np.maximum.accumulate(np.where(self.first, rows, -1))
         return np.where(start >= 0, rows - start, rows + before)
 
+    @property
+    def ended(self) -> np.ndarray:
+        """[B] bool, whether the episode ends with this step."""
+        return self.terminated | self.truncated
+
+    def episode_numbers(self, before: int) -> np.ndarray:
+        """The number [B] of each step's episode, of which ``before`` ended before the first row."""
+        return before + np.searchsorted(np.flatnonzero(self.ended), np.arange(len(self)))
+
 
 def mixed_rewards() -> UsageError:
     """Steps of sources with rewards beside steps of sources without."""
@@ -95,7 +104,7 @@ def joined(pieces: Sequence[Steps]) -> Steps:
     return Steps(**columns, rewards=np.concatenate(rewards) if rewards else None, place=nowhere)
 
 
-def pieces(parts: Iterable[Steps], size: int = PIECE) -> Iterator[Steps]:
+def pieces(parts: Iterable[Steps], size: int) -> Iterator[Steps]:
     """``parts`` divided anew into pieces of ``size`` steps and a last one that may be smaller.
 
     What is written then does not depend on how its source was divided.
@@ -121,7 +130,7 @@ def episodes(parts: Iterable[Steps]) -> Iterator[Steps]:
     waiting: list[Steps] = []
     for part in parts:
         begin = 0
-        for end in np.flatnonzero(part.terminated | part.truncated).tolist():
+        for end in np.flatnonzero(part.ended).tolist():
             yield joined([*waiting, part.take(slice(begin, end + 1))])
             waiting, begin = [], end + 1
         if begin < len(part):
@@ -212,7 +221,7 @@ class Check:
         self._check_order(steps)
         t = steps.times(self._t)
         last = np.append(steps.first[1:], complete)
-        ended = steps.terminated | steps.truncated
+        ended = steps.ended
         long = t >= self.horizon
         unended = last & ~ended & (t < self.horizon - 1)
         if not self.irregular.cut:
@@ -287,7 +296,7 @@ class Check:
 
     def _check_order(self, steps: Steps) -> None:
         goes_on = ~steps.first
-        ended = np.append(self._ended, (steps.terminated | steps.truncated)[:-1])
+        ended = np.append(self._ended, steps.ended[:-1])
         _refuse(
             steps,
             goes_on & ended,

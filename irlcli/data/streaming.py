@@ -80,7 +80,7 @@ def write_demonstrations(
 
     Raises:
         OSError: the directory cannot be written.
-        ValueError: no trajectory, or trajectories of different shapes.
+        ValueError: no trajectory.
     """
     settings = [setting for setting, _ in groups]
     episodes = [(index, t) for index, (_, group) in enumerate(groups) for t in group]
@@ -145,9 +145,9 @@ class _EpisodeTable:
         """The rows of ``steps.parquet`` for ``steps``, with ``schema``."""
         if (steps.rewards is not None) != self._rewarded:
             raise mixed_rewards()
-        ends = np.flatnonzero(steps.terminated | steps.truncated)
+        ends = np.flatnonzero(steps.ended)
         t = steps.times(self._length)
-        episode = self._count + np.searchsorted(ends, np.arange(len(steps)))
+        episode = steps.episode_numbers(self._count)
         self._parts.append(
             (
                 steps.settings[ends],

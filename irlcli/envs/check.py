@@ -46,7 +46,7 @@ def check(spec: EnvironmentSpec, listed: Mapping[str, Sequence[Setting]]) -> Ite
         spec: a known environment.
         listed: settings of each knob, by the knob's name, that its settings file lists.
     """
-    made = _outcome("it can be made", partial(_make, spec, Setting()))
+    made = _outcome("it can be made", partial(_episode, spec, Setting()))
     yield made
     if made.wrong:
         return
@@ -95,7 +95,7 @@ def _ends(knob: Knob) -> list[Value]:
             return [Value(form, (x,)) for x in (knob.low, knob.high)]
 
 
-def _make(spec: EnvironmentSpec, setting: Setting) -> list[np.ndarray]:
+def _episode(spec: EnvironmentSpec, setting: Setting) -> list[np.ndarray]:
     """An episode of random actions: observations [T + 1, D] and rewards [T]."""
     with closing(make(spec.name, setting)) as world:
         actions = np.random.default_rng(_SEED)
@@ -126,7 +126,7 @@ def _check_env(spec: EnvironmentSpec) -> None:
 
 
 def _check_seeds(spec: EnvironmentSpec) -> None:
-    if not _equal(*(_make(spec, Setting()) for _ in range(2))):
+    if not _equal(*(_episode(spec, Setting()) for _ in range(2))):
         raise _Wrong("two episodes of the same seed and the same actions differ")
 
 
@@ -139,12 +139,12 @@ def _check_symmetries(spec: EnvironmentSpec) -> None:
 
 def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting]) -> None:
     for setting in ends:
-        _make(spec, setting)
+        _episode(spec, setting)
 
 
 def _check_one(spec: EnvironmentSpec, name: str) -> None:
     if not _equal(
-        _make(spec, Setting()), _make(spec, Setting(((name, Value("multiplier", (1.0,))),)))
+        _episode(spec, Setting()), _episode(spec, Setting(((name, Value("multiplier", (1.0,))),)))
     ):
         raise _Wrong(
             "its episodes differ from those without it, with equal seeds and actions: let the constructor "
@@ -153,7 +153,7 @@ def _check_one(spec: EnvironmentSpec, name: str) -> None:
 
 
 def _check_moves(spec: EnvironmentSpec, name: str, settings: Sequence[Setting]) -> None:
-    episodes = [_make(spec, setting) for setting in settings]
+    episodes = [_episode(spec, setting) for setting in settings]
     sizes = [observations.shape[1] for observations, _ in episodes]
     if len(set(sizes)) > 1 and not spec.knobs[name].observed:
         raise _Wrong(

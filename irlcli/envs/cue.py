@@ -15,6 +15,7 @@ have seen.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -55,9 +56,13 @@ def qualities(rewards: np.ndarray, cue: Cue) -> np.ndarray:
 
     Before the first reward it is bad, unless the bar is negative.
     """
-    sums = np.concatenate([[0.0], np.cumsum(rewards)])
-    earlier = np.maximum(np.arange(len(sums)) - cue.window, 0)
-    return np.where(sums - sums[earlier] > cue.bar, 1.0, -1.0).astype(np.float32)
+    sums = [0.0, *np.cumsum(rewards).tolist()]
+    return np.array([_quality(sums, t, cue) for t in range(len(sums))], dtype=np.float32)
+
+
+def _quality(sums: Sequence[float], t: int, cue: Cue) -> float:
+    """The quality at time ``t``, from the sums of the rewards before each time."""
+    return 1.0 if sums[t] - sums[max(t - cue.window, 0)] > cue.bar else -1.0
 
 
 class CueWorld(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
@@ -99,8 +104,7 @@ class CueWorld(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return self._hinted(observation), reward, terminated, truncated, info
 
     def _hinted(self, observation: np.ndarray) -> np.ndarray:
-        earlier = self._sums[max(len(self._sums) - 1 - self._cue.window, 0)]
-        quality = 1.0 if self._sums[-1] - earlier > self._cue.bar else -1.0
+        quality = _quality(self._sums, len(self._sums) - 1, self._cue)
         return np.concatenate([observation, quality * self._rightness.draw()[0]], dtype=np.float32)
 
 

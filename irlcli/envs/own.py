@@ -21,7 +21,7 @@ from irlcli.configs.documents import converted, read_toml
 from irlcli.configs.load import check_profile
 from irlcli.configs.schema import Config
 from irlcli.envs.code import code_of
-from irlcli.envs.registry import BUILT_IN
+from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.envs.spec import Code, EnvironmentSpec, Form, Knob, Own
 from irlcli.errors import NotFound, UsageError, suggest
 
@@ -243,7 +243,7 @@ def _check_name(name: str) -> None:
             f"{name!r} cannot be the name of an environment",
             "write name = ... in [env]: up to 40 letters, digits, '-' and '_', a letter first",
         )
-    if name in BUILT_IN:
+    if name in ENVIRONMENTS:
         raise UsageError(
             f"{name!r} is a built-in environment", "rename the file, or write name = ... in [env]"
         )

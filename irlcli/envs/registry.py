@@ -19,7 +19,6 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
     spec.name: spec
     for spec in (LUNAR_LANDER, ANT, HALF_CHEETAH, REACHER, *MUJOCO_ROBOTS, GRIDWORLD)
 }
-BUILT_IN = tuple(ENVIRONMENTS)
 # Environments from outside the package that this process knows.
 _KNOWN: dict[str, EnvironmentSpec] = {}
 

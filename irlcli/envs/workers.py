@@ -133,7 +133,7 @@ class WorkerWorlds:
         self,
         factories: Sequence[Callable[[], gymnasium.Env]],
         max_episode_steps: int,
-        workers: int = 2,
+        workers: int,
     ):
         sample = factories[0]()
         self.observation_space = sample.observation_space

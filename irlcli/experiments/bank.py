@@ -12,8 +12,9 @@ from irlcli import labels
 from irlcli.configs import Config
 from irlcli.data.descriptions import Reward
 from irlcli.errors import NotFound
+from irlcli.experiments.inputs import source_in
 from irlcli.experiments.references import student_beside
-from irlcli.experiments.status import Lookup, source_in
+from irlcli.experiments.status import Lookup
 from irlcli.interventions import Setting, parse_setting
 from irlcli.stages import clone, record, train_expert
 from irlcli.stages.assess import Entry
@@ -122,7 +123,7 @@ class Finder:
         settings: Sequence[Setting],
         demos: Source | None,
         cloned: Sequence[str],
-        seed: int = 0,
+        seed: int,
     ) -> Policies:
         """The policies that exist for a bank in ``settings``, and a clone that can be made.
 

@@ -79,7 +79,7 @@ class StageCheckpoints:
             )
 
     def listening(self) -> AbstractContextManager[None]:
-        """Let SIGINT or SIGTERM request a stop at the end of the round; a second one stops at once."""
+        """Let a signal request a stop at the end of the round; a second one stops at once."""
 
         def handle() -> None:
             if self.stop_requested:

@@ -12,7 +12,7 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
     """The parameters behind an evaluation that all its seeds share, by ``STAGE.FIELD``.
 
     They exclude the seeds of training, and a lambda that was chosen for each seed. The seed of the
-    evaluation is one of them: other start states are another measurement. An input from outside the
+    evaluation is included: other start states are another measurement. An input from outside the
     store contributes only its content. The names for a reward other than the policy's own begin
     with ``reward.``.
     """
@@ -45,13 +45,13 @@ def by_own_reward(evaluation: Artefact, index: Index) -> bool:
     if "reward" not in inputs or "policy" not in inputs:
         return False
     return any(
-        inputs["reward"] in (maker.manifest.record.inputs.get("reward"), *_contents(maker))
+        inputs["reward"]
+        in (
+            maker.manifest.record.inputs.get("reward"),
+            *(output.sha256 for output in maker.manifest.outputs),
+        )
         for maker in index.holders(inputs["policy"])
     )
-
-
-def _contents(artefact: Artefact) -> list[str]:
-    return [output.sha256 for output in artefact.manifest.outputs]
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

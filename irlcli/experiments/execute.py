@@ -11,11 +11,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
-from irlcli.errors import Interrupted
+from irlcli.errors import Interrupted, IrlError
 from irlcli.experiments.failures import LAST_LINES, Failure, failure
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.runner import Runner
@@ -162,7 +163,7 @@ class Execution:
                     self._loop()
                 finally:
                     for child in self._running.values():
-                        child.stop(at_once=True)
+                        child.stop(at_once=False)
         return replace(self._outcome, blocked=self._waiting, interrupted=self._signals > 0)
 
     def _loop(self) -> None:
@@ -200,7 +201,10 @@ class Execution:
     def _copy(self, name: str) -> bool:
         """Copy a step's artefact; otherwise a process makes it, or waits for another one."""
         why = self._plan.step(name).why
-        copied = self._runner.copy(self._plan.tasks[name].request, self._plan.lookup)
+        copied = None
+        # The process that is started instead tries again, and reports what is wrong.
+        with suppress(IrlError):
+            copied = self._runner.copy(self._plan.tasks[name].request, self._plan.lookup)
         self._plan.lookup.forget_missing()
         if copied is not None:
             self._display.copied(name, why)
@@ -264,5 +268,5 @@ class Execution:
         self._passed_on = min(self._signals, 2)
 
     def _signal(self) -> None:
-        """SIGINT or SIGTERM ask the processes to stop; a second one kills them."""
+        """A signal asks the processes to stop; a second one kills them."""
         self._signals += 1

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from irlcli.errors import NotFound, UsageError
-from irlcli.experiments.status import foreign_source
+from irlcli.experiments.inputs import foreign_source
 from irlcli.stages.base import Source
 
 if TYPE_CHECKING:

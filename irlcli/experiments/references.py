@@ -11,8 +11,8 @@ from typing import Literal, overload
 
 from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
+from irlcli.experiments.inputs import foreign_source, source_in
 from irlcli.experiments.introduce import introduce
-from irlcli.experiments.status import foreign_source, source_in
 from irlcli.stages.base import Source
 from irlcli.store import Artefact, Store, read_json
 

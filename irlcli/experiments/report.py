@@ -12,9 +12,9 @@ import msgspec
 from irlcli.configs import ExpertConfig
 from irlcli.errors import NotFound
 from irlcli.experiments import facts
+from irlcli.experiments.inputs import source_in
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import made_by
-from irlcli.experiments.status import source_in
 from irlcli.interventions import listed_settings, without_cue
 from irlcli.report.parameters import ASSESS, CUE, Cell, Row
 from irlcli.stages import report, report_experts

@@ -12,6 +12,7 @@ A task's name is that of its row and what it makes::
     ROW.METHOD.SEED.transfer-1  ....transfer-1-returns  ...      further retrainings
     ROW.VARIANT.METHOD.SEED...                                   of tables with variants
     ROW.METHOD.SEED.choice                                       lambda, with --choose-penalty
+    ROW.METHOD.SEED.choice.LAMBDA.without-VALUE  ....returns     its trials
     ROW.METHOD.SEED.cue
     ROW.clone  ROW.bank.POLICY.VALUE  ROW.METHOD.SEED.bank.POLICY.VALUE  ROW.METHOD.SEED.assess
 """

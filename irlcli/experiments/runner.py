@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed, file_failure
+from irlcli.experiments.inputs import checked, foreign_source, source_in
 from irlcli.experiments.introduce import described
-from irlcli.experiments.status import Lookup, Step, checked, foreign_source, key_record, source_in
+from irlcli.experiments.status import Lookup, Step, key_record
 from irlcli.stages.base import Console, From, Job, Request, Source
 from irlcli.store import Artefact, KeyRecord, Store
 

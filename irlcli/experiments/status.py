@@ -3,27 +3,19 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import msgspec
 
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.experiments.inputs import source_in
 from irlcli.stages.base import From, Request, Source
-from irlcli.store import (
-    Artefact,
-    KeyRecord,
-    Resolved,
-    Store,
-    content_digest,
-    directory_outputs,
-    file_digest,
-)
+from irlcli.store import Artefact, KeyRecord, Store
 
 if TYPE_CHECKING:
     from irlcli.store.sources import Found, Place
 
 Status = Literal["HIT", "FOUND", "RUN", "RESUME", "BLOCKED"]
-STATUSES: tuple[Status, ...] = ("HIT", "FOUND", "RUN", "RESUME", "BLOCKED")
+STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 class Step(NamedTuple):
@@ -178,67 +170,3 @@ def key_record(request: Request, inputs: Mapping[str, str]) -> KeyRecord:
     """The key record of ``request``, given the sha256 of each input."""
     stage, parameters = request.stage, msgspec.to_builtins(request.parameters)
     return KeyRecord(stage.name, stage.version, parameters, dict(inputs))
-
-
-def source_in(artefact: Artefact, output: str | None) -> Source:
-    """An output of ``artefact`` as a stage's input; without ``output``, all of it.
-
-    Raises:
-        NotFound: the artefact has no such output.
-    """
-    if output is None:
-        return Source(artefact.directory, artefact.manifest.content, artefact)
-    return Source(artefact.directory / output, artefact.output(output).sha256, artefact)
-
-
-def checked(store: Store, source: Source) -> Path:
-    """Where ``source`` lies, after its bytes in ``store`` were compared with their digests.
-
-    A file outside a store is not compared.
-
-    Raises:
-        IntegrityError: the bytes differ.
-    """
-    artefact = source.artefact
-    if artefact is None:
-        return source.path
-    if source.path != artefact.directory:
-        return store.open(artefact, source.path.relative_to(artefact.directory).as_posix())
-    for output in artefact.manifest.outputs:
-        store.open(artefact, output.path)
-    return source.path
-
-
-def source_of(resolved: Resolved) -> Source:
-    """A resolved reference as a stage's input.
-
-    Raises:
-        UsageError, IntegrityError: as :func:`foreign_source`.
-    """
-    if resolved.artefact is None:
-        return foreign_source(resolved.path)
-    return source_in(resolved.artefact, resolved.output)
-
-
-def foreign_source(path: Path) -> Source:
-    """A file or a directory outside the store as a stage's input.
-
-    Raises:
-        UsageError: a directory without files, or a path that cannot be read.
-        IntegrityError: a directory that holds links, pipes or names that no output can have.
-    """
-    try:
-        if path.is_file():
-            return Source(path, file_digest(path))
-        outputs = directory_outputs(path)
-        if not outputs:
-            raise UsageError(f"{path} holds no files", "name a file or an artefact")
-        return Source(path, content_digest(outputs))
-    except OSError as error:
-        raise UsageError(
-            f"{path} cannot be read ({error.strerror})", "name a file or an artefact"
-        ) from None
-    except ValueError as error:
-        raise IntegrityError(
-            f"{path}: {error}", "name a directory of plain files, or an artefact"
-        ) from None

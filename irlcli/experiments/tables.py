@@ -221,8 +221,6 @@ def narrowed(
                 *(environment(env) for env in sorted(own) if is_known(env) or env in announced())
             )
         names = {name: None for row in offered for name in (row.env, str(row))}
-        if not rows:
-            raise UsageError("--rows: the list is empty", f"name some of: {', '.join(names)}")
         _check_list("--rows", rows, names)
         changes["rows"] = tuple(row for row in offered if {row.env, str(row)} & set(rows))
     return msgspec.structs.replace(table, **changes)

@@ -59,7 +59,7 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
     known = {*signature.parameters} - {"self"}
     forms = {p.name: _forms(str(p.annotation)) for p in signature.parameters.values()}
     if "configs" in known:
-        known = {*known, *Configs.__annotations__} - {"configs"}
+        known = {*known, *_CONFIGS} - {"configs"}
         forms |= {name: _forms(kind.__forward_arg__) for name, kind in _CONFIGS.items()}
     shown = method.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
@@ -69,10 +69,9 @@ def plainly(method: Callable[_P, _R]) -> Callable[_P, _R]:
         for name in kwargs.keys() - known:
             raise UsageError(f"{shown} has no argument {name!r}", suggest(name, known))
         try:
-            signature.bind(*args, **kwargs)
+            given = signature.bind(*args, **kwargs).arguments
         except TypeError as error:
             raise UsageError(f"{shown}: {error}", f"write {shown}{_shape(signature)}") from None
-        given = signature.bind_partial(*args, **kwargs).arguments
         configs = given.pop("configs", {})
         for name, value in (given | configs).items():
             _check_form(name, value, forms[name])
@@ -175,6 +174,7 @@ def _element(value: Any) -> str:
 
 
 def listed(given: Any) -> list[Any]:
+    """One value, or several, as a list."""
     return [given] if isinstance(given, str | Path) else list(given)
 
 
@@ -186,6 +186,11 @@ def joined(given: Any) -> str | None:
 
 
 def number(name: str, given: float | None) -> float | None:
+    """``given`` as a float.
+
+    Raises:
+        UsageError: an integer that no float can hold.
+    """
     try:
         return None if given is None else float(given)
     except OverflowError:
@@ -193,6 +198,11 @@ def number(name: str, given: float | None) -> float | None:
 
 
 def whole(name: str, given: int, least: int = 0) -> int:
+    """``given`` as an int.
+
+    Raises:
+        UsageError: less than ``least``, or more than options accept.
+    """
     number = operator.index(given)
     if number < least:
         raise UsageError(f"{name} {number} is less than {least}", f"write {name}={least} or more")

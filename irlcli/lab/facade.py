@@ -192,7 +192,7 @@ class Lab:
         """
         options = self._options(locals())
         with self._at_work(configs, words("train-airl", options)) as session:
-            request = train.train_airl(session, **options)
+            request = train.train_airl(session, **options, name=name)
             assert request is not None  # A lab has no dry run.
             return self._run(session, request, name)
 

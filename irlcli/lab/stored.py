@@ -60,7 +60,7 @@ class Stored:
     def to_pandas(self, output: str | None = None) -> pd.DataFrame:
         """The table that the stage leaves, or another one of its ``.parquet`` outputs.
 
-        A row per setting of demonstrations (``summary.json``) and of a MaxEnt reward
+        A row per setting of demonstrations or of a recording (``summary.json``) and of a MaxEnt reward
         (``quality.json``), per agent and setting of an evaluation, per policy and setting of an
         assessment, and per round and setting of any other training (``metrics.parquet``).
 
@@ -83,7 +83,9 @@ class Stored:
         if output.endswith(".parquet"):
             return pd.read_parquet(self.output(output))
         if output in _TABLES:
-            rows = pd.DataFrame(read_json(self.output(output))["settings"])
+            document = read_json(self.output(output))
+            # A recording is of one setting.
+            rows = pd.DataFrame(document.get("settings", [document]))
             return rows[["setting", *rows.columns.drop("setting")]]
         raise UsageError(
             f"{self.id} ({self.stage}) has no table {output}".rstrip(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -56,9 +56,10 @@ class FrozenReward:
                 "the same kind of intervention as in training",
             )
         theirs = (actions.discrete, actions.size, actions.choices)
-        if (network.discrete, network.action_size, network.choices) != theirs:
+        ours = (network.discrete, network.action_size, network.choices)
+        if ours != theirs:
             raise UsageError(
-                f"the reward takes {_actions(network)}, but {where} has {_actions(actions)}",
+                f"the reward takes {actions_in_words(*ours)}, but {where} has {actions_in_words(*theirs)}",
                 "a reward belongs to the environment it was learned in",
             )
         self._ceiling = math.inf if ceiling is None else level_of(origin.quantiles, ceiling)
@@ -103,9 +104,8 @@ class FrozenReward:
         return episode_reward(self._model, data, self._absorbing, self._ceiling) / self._scale
 
 
-def _actions(described: Any) -> str:
-    """A reward network's or an environment's actions in words."""
-    size = getattr(described, "action_size", None) or described.size
-    if described.choices:
-        return f"discrete actions of {' x '.join(map(str, described.choices))} choices"
-    return f"{size} discrete actions" if described.discrete else f"actions of size {size}"
+def actions_in_words(discrete: bool, size: int, choices: Sequence[int]) -> str:
+    """Actions as :class:`irlcli.trajectories.ActionSpace` describes them, for messages."""
+    if choices:
+        return f"discrete actions of {' x '.join(map(str, choices))} choices"
+    return f"{size} discrete actions" if discrete else f"actions of size {size}"

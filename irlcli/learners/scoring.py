@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -117,7 +116,7 @@ def level_of(quantiles: Sequence[float], share: float) -> float:
 
 
 def episode_reward(
-    model: RewardModule, data: Transitions, absorbing: bool, ceiling: float = math.inf
+    model: RewardModule, data: Transitions, absorbing: bool, ceiling: float
 ) -> float:
     """Undiscounted sum of min(g, ``ceiling``) over ``data``; with ``absorbing``, up to the horizon."""
     with torch.no_grad():

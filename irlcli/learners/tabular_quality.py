@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 
 from irlcli.learners.occupancy import Demonstrations
 from irlcli.learners.soft_values import Solution, solve
-from irlcli.tabular import StackedMDPs, evaluate, forward, optimal_policy, true_reward
+from irlcli.tabular import StackedMDPs, backward, evaluate, forward, true_reward
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Quality:
     :class:`irlcli.learners.maxent.Record` has another likelihood.
 
     ``value_difference`` may be slightly negative near a tight horizon, see
-    :func:`irlcli.tabular.optimal_policy`.
+    :func:`irlcli.tabular.backward`.
     """
 
     goal_probability: np.ndarray  # of reaching the goal within the horizon
@@ -41,11 +41,11 @@ def assess(
     recovered value is constant. ``held_out`` has episodes of each setting's own expert.
 
     Raises:
-        ValueError: as :func:`irlcli.tabular.optimal_policy`.
+        ValueError: as :func:`irlcli.tabular.backward`.
     """
-    best_policy, best_value = optimal_policy(settings, true_reward(settings), horizon)
+    best_policy, best_value = backward(settings, true_reward(settings), horizon)
     best = evaluate(settings, best_policy)
-    policy, value = optimal_policy(settings, reward, horizon)
+    policy, value = backward(settings, reward, horizon)
     found = evaluate(settings, policy)
     uniform = np.full((horizon, *policy.shape[1:4], 1), 1.0 / policy.shape[1])
     reachable = forward(settings, uniform)[0][0] > 0.0

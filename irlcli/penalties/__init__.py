@@ -89,6 +89,8 @@ class Penalty(NamedTuple):
             penalty's own scale.
         bounded: whether lambda times the penalty is bounded for any lambda, so that the loss is not
             divided by lambda.
+        additive: whether it reads ``Samples.parameters`` or ``input_gradient``. The penalty of several
+            networks at once must then be the sum of each one's: the controls train them so.
         version: a change that alters its results must raise it. It is part of the keys of learned
             rewards. The stages of the controls have versions of their own: raise them, too.
     """
@@ -99,6 +101,7 @@ class Penalty(NamedTuple):
     reads: tuple[str, ...] = ("penalty_scaling", "penalty_estimate")
     candidates: tuple[float, ...] = (1.0, 100.0, 10_000.0)
     bounded: bool = False
+    additive: bool = False
     version: int = 1
 
 
@@ -118,11 +121,17 @@ PENALTIES: dict[str, Penalty] = {
         bounded=True,
         version=2,
     ),
-    "iga": Penalty("irlcli.penalties.iga", ("airl",), True, ("penalty_estimate",)),
+    "iga": Penalty("irlcli.penalties.iga", ("airl",), True, ("penalty_estimate",), additive=True),
     "input-gradient": Penalty(
-        "irlcli.penalties.input_gradient", ("airl",), reads=(), candidates=(0.1, 1.0, 10.0)
+        "irlcli.penalties.input_gradient",
+        ("airl",),
+        reads=(),
+        candidates=(0.1, 1.0, 10.0),
+        additive=True,
     ),
-    "l2": Penalty("irlcli.penalties.l2", ("airl",), reads=(), candidates=(1e-4, 1e-3, 1e-2)),
+    "l2": Penalty(
+        "irlcli.penalties.l2", ("airl",), reads=(), candidates=(1e-4, 1e-3, 1e-2), additive=True
+    ),
 }
 
 

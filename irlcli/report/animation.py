@@ -42,7 +42,7 @@ def film(
     settings: Sequence[Setting],
     steps: int,
     seed: int,
-    rewards: Sequence[FrozenReward] | None = None,
+    rewards: Sequence[FrozenReward] | None,
 ) -> Film:
     """One episode of ``policy`` in each setting, all from ``seed``, in real time.
 

@@ -177,7 +177,7 @@ def identical(episodes: Episodes) -> list[str]:
 
 
 def without_p(comparisons: pd.DataFrame) -> list[str]:
-    """A caveat per row and reason; the table of comparisons tells which."""
+    """A caveat per row and reason; comparisons.csv tells which."""
     counts = comparisons[comparisons["why"] != ""].groupby(["row", "why"], sort=False).size()
     total = comparisons.groupby("row", sort=False).size()
     return [

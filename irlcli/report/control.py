@@ -88,7 +88,7 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
         "invariant optimum 0.75 and 0.75 (Arjovsky et al. 2019, Sec. 5.2).",
         markdown_table(
             ["method", "accuracy trained on", "accuracy unseen"],
-            cells.rows("coloured digits", ACCURACIES, 2),
+            cells.rows("coloured digits", ACCURACIES),
         ),
         "## Linear unit tests",
         f"{c.seeds} seeds, linear classifiers, three settings (Aubin et al. 2021). Accuracy where "
@@ -98,8 +98,8 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
             [
                 [name, one, other]
                 for (name, one), (_, other) in zip(
-                    cells.rows("example 2", ("unseen",), 2),
-                    cells.rows("example 3", ("unseen",), 2),
+                    cells.rows("example 2", ("unseen",)),
+                    cells.rows("example 3", ("unseen",)),
                     strict=True,
                 )
             ],
@@ -112,7 +112,7 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
     ]
     for features in ("linear", "learned"):
         own = [*cells.cases(f"{features}."), f"cold.{features}"]
-        rows = [row for case in own for row in cells.rows(case, wanted, 2)]
+        rows = [row for case in own for row in cells.rows(case, wanted)]
         parts += [f"### {features.capitalize()} features", markdown_table(columns, rows)]
     parts += [
         "## Number of settings",
@@ -144,13 +144,13 @@ class _Cells:
     def methods(self, case: str) -> list[str]:
         return list(self._frame[self._frame["case"] == case]["method"].unique())
 
-    def text(self, case: str, method: str, measure: str, digits: int) -> str:
+    def text(self, case: str, method: str, measure: str) -> str:
         cell = self._cells.loc[(case, method, measure)]
-        return interval_text(cell["mean"], cell["low"], cell["high"], digits)
+        return interval_text(cell["mean"], cell["low"], cell["high"], 2)
 
-    def rows(self, case: str, measures: Sequence[str], digits: int) -> list[list[str]]:
+    def rows(self, case: str, measures: Sequence[str]) -> list[list[str]]:
         return [
-            [method, *(self.text(case, method, measure, digits) for measure in measures)]
+            [method, *(self.text(case, method, measure) for measure in measures)]
             for method in self.methods(case)
         ]
 
@@ -167,7 +167,7 @@ def _across(cells: _Cells, starts: dict[str, str]) -> str:
     for colours in (1, 2):
         names = [f"{start}{colours}" for start in starts.values()]
         for method in cells.methods(names[0]):
-            texts = [cells.text(case, method, "quality", 2) for case in names]
+            texts = [cells.text(case, method, "quality") for case in names]
             rows.append([str(colours), method, *texts])
     return markdown_table(["colours", "method", *starts], rows)
 
@@ -175,7 +175,7 @@ def _across(cells: _Cells, starts: dict[str, str]) -> str:
 def _by_gap(cells: _Cells, gaps: Sequence[float]) -> str:
     names = [f"gap.{gap:g}" for gap in gaps]
     rows = [
-        [method, *(cells.text(case, method, "quality", 2) for case in names)]
+        [method, *(cells.text(case, method, "quality") for case in names)]
         for method in cells.methods(names[0])
     ]
     return markdown_table(["method", *(f"gap {gap:g}" for gap in gaps)], rows)
@@ -189,7 +189,7 @@ def _chosen(cells: _Cells, chosen: pd.DataFrame, strengths: Sequence[Sequence[fl
         own = chosen[chosen["case"] == case]
         for method in cells.methods(case):
             count = int((own["method"] == method).sum())
-            quality = cells.text(case, method, "quality", 2)
+            quality = cells.text(case, method, "quality")
             rows.append([_percents(shares), method, f"{count} of {len(own)}", quality])
         sample = own["quality"].to_numpy()
         text = interval_text(sample.mean(), *bootstrap_interval(sample), 2)

@@ -120,8 +120,7 @@ def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) ->
             axis.plot([x + 0.25] * 2, [cell["low"], cell["high"]], color=colour, lw=1.5)
     printed = paper_row(p, row, measure)
     if printed is not None:
-        theirs = {"erm": printed.erm, "irm": printed.irm}
-        for method, value in theirs.items():
+        for method, value in (("erm", printed.erm), ("irm", printed.irm)):
             if method in p.methods:
                 axis.errorbar(
                     p.methods.index(method) - 0.33,
@@ -129,7 +128,7 @@ def _panel(axis: Axes, p: Parameters, report: Report, row: Row, measure: str) ->
                     value.deviation,
                     fmt="D",
                     **{"ms": 4, "mfc": "none", "color": ink, "alpha": 0.6, "lw": 0.8},
-                    label="paper, ± sd" if method == next(iter(theirs)) else None,
+                    label="paper, ± sd",
                 )
     axis.set_xticks(
         range(len(p.methods)), [title(m).replace(", ", ",\n") for m in p.methods], size=7.5

@@ -134,12 +134,8 @@ def _field(name: str) -> str:
 def _row(agent: str, env: str, setting: str, runs: Sequence[_Run]) -> AgentRow:
     by_seeds: dict[tuple[int | None, ...], Returns] = {}
     for seeds, item, _ in runs:
-        if seeds in by_seeds and seeds == (None,):
-            raise UsageError(
-                f"{agent} in {setting} appears twice: it is one agent, whatever the seed of its "
-                "episodes",
-                "name one evaluation of it",
-            )
+        if seeds in by_seeds and seeds[0] is None:
+            raise UsageError(f"{agent} in {setting} appears twice", "name one evaluation of it")
         if seeds in by_seeds:
             which = " under the reward of seed ".join(map(str, seeds))
             raise UsageError(

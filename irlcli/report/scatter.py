@@ -35,7 +35,9 @@ def draw_bank(directory: Path, assessment: Assessment) -> None:
     with style("black"):
         _scatter(panels).savefig(directory / "scatter.png", dpi=_DPI)
     with style(INK):
-        (directory / "scatter.svg").write_text(as_svg(_scatter(panels), "scatter") + "\n")
+        (directory / "scatter.svg").write_text(
+            as_svg(_scatter(panels), "scatter") + "\n", encoding="utf-8"
+        )
 
 
 def draw_banks(directory: Path, p: Parameters, assessments: Assessments) -> dict[str, str]:

@@ -7,14 +7,14 @@ import pandas as pd
 
 def number(value: Any, digits: int = 1) -> str:
     """``value`` to ``digits`` decimals."""
-    return "-" if value is None or pd.isna(value) else f"{value:.{digits}f}"
+    return "-" if pd.isna(value) else f"{value:.{digits}f}"
 
 
 def percent(share: Any) -> str:
     """A share of one, to a tenth of a per cent."""
-    return "-" if share is None or pd.isna(share) else f"{share:.1%}"
+    return "-" if pd.isna(share) else f"{share:.1%}"
 
 
 def p_value(value: Any) -> str:
     """A p-value to three digits."""
-    return "-" if value is None or pd.isna(value) else "< .001" if value < 1e-3 else f"{value:.3f}"
+    return "-" if pd.isna(value) else "< .001" if value < 1e-3 else f"{value:.3f}"

@@ -291,21 +291,20 @@ def weights(text: str) -> list[float] | Literal["own"]:
 
 
 def weights_set(overrides: Sequence[str]) -> list[str]:
-    """Those of ``--set`` that set lambda of AIRL."""
-    return [item for item in overrides if field_of(item) == PENALTY_WEIGHT]
+    """The ``--set`` options that set lambda of AIRL."""
+    return [f"--set {item}" for item in overrides if field_of(item) == PENALTY_WEIGHT]
 
 
-def check_chosen(choose_penalty: str | None, overrides: Sequence[str]) -> None:
-    """Refuse ``--set airl.penalty_weight`` beside ``--choose-penalty``, which would replace it.
+def check_chosen(overrides: Sequence[str], penalty_weight: float | None = None) -> None:
+    """Refuse a lambda that is given beside ``--choose-penalty``, which would replace it.
 
     Raises:
         UsageError: names both.
     """
     given = weights_set(overrides)
-    if choose_penalty is not None and given:
-        raise UsageError(
-            f"--set {given[-1]} and --choose-penalty both set lambda", "give one of them"
-        )
+    given += [] if penalty_weight is None else ["--penalty-weight"]
+    if given:
+        raise UsageError(f"{given[-1]} and --choose-penalty both set lambda", "give one of them")
 
 
 def method_fields(

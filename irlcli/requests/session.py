@@ -264,7 +264,8 @@ class StageSession(Session):
 
 
 def _is_smoke(provenance: Mapping[str, Any]) -> bool:
-    command = list(provenance.get("command") or ())
+    command = provenance.get("command")
+    command = command if isinstance(command, list) else []
     return f"--profile={_SMOKE}" in command or ["--profile", _SMOKE] in map(list, pairwise(command))
 
 

@@ -122,7 +122,7 @@ def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
             raise UsageError(
                 f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
             )
-        arguments.check_chosen(choice.choose_penalty, session.overrides)
+        arguments.check_chosen(session.overrides)
         candidates = arguments.weights(choice.choose_penalty)
     tag = _tag(table, session.profile) if choice.tag is None else choice.tag
     try:
@@ -154,7 +154,7 @@ def _tag(table: "Table", profile: str) -> str:
 def _check_weights(session: StageSession, table: "Table") -> None:
     """Refuse a lambda for all methods where the table lists one for some of them."""
     listed = [method for method in table.methods if method in table.penalty_weights]
-    given = [f"--set {item}" for item in arguments.weights_set(session.overrides)]
+    given = arguments.weights_set(session.overrides)
     if session.file is not None:
         knobs = {row.knob for row in table.rows}
         for source, values in in_profile(

@@ -4,9 +4,8 @@ import msgspec
 
 from irlcli.configs.load import unseen_settings
 from irlcli.data import descriptions
-from irlcli.errors import UsageError
+from irlcli.experiments.inputs import source_in
 from irlcli.experiments.references import demonstrations
-from irlcli.experiments.status import source_in
 from irlcli.interventions import check_tabular, parse_setting
 from irlcli.methods import METHODS
 from irlcli.penalties import maxent_methods
@@ -33,13 +32,14 @@ def train_airl(
     state_only: bool | None,
     env: str | None,
     seed: int,
+    name: str | None,
 ) -> Request | None:
     """A reward and a student, or a behavioural clone. ``choose_penalty`` is run here.
 
     None if lambda is to be chosen but nothing may be run.
 
     Raises:
-        UsageError: unknown, contradictory or ineffective options.
+        UsageError: unknown, contradictory or ineffective options, or a bad name.
         NotFound: no such demonstrations.
     """
     known = arguments.env_name(env)
@@ -71,11 +71,9 @@ def train_airl(
     if choose_penalty is not None:
         # A bad option must fail before the choice of lambda, which takes long.
         airl_stage.request(source, env, settings, airl, seed)
-        if penalty_weight is not None:
-            raise UsageError(
-                "--penalty-weight and --choose-penalty both set lambda", "give one of them"
-            )
-        arguments.check_chosen(choose_penalty, session.overrides)
+        arguments.check_chosen(session.overrides, penalty_weight)
+        if name is not None:
+            session.store.check_name(name)
         weights = arguments.weights(choose_penalty)
         request = choice.request(source, env, settings, airl, config.evaluation, weights, seed)
         chosen = _chosen(session, request)

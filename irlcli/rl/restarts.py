@@ -91,6 +91,7 @@ class Restarts:
                 self._start(len(self.scores), rows)
             else:
                 self._start(self.scores.index(max(self.scores)), rows, self._best)
+                self._best = {}
         self._training.run(report, warn)
         return [row | {"kept": row["restart"] == self._index} for row in self.rows]
 

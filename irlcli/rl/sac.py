@@ -60,8 +60,9 @@ class _Replay(ReplayBuffer):
 class SACTrainer:
     """SB3's SAC, one seeded round at a time.
 
-    Each of ``train_freq`` steps of every world is followed by ``gradient_steps`` updates. With
-    ``normalise_observations`` the moments of all networks take in the steps before the updates.
+    After every ``train_freq`` steps of each world come ``gradient_steps`` updates, once more than
+    ``learning_starts`` steps are done. With ``normalise_observations`` the moments of all networks take
+    in the steps before the updates.
 
     Args:
         worlds: the environments to learn in, with continuous actions.

@@ -72,6 +72,7 @@ def run(job: Job) -> None:
     """Score every recorded episode by the reward, and compare with the true returns."""
     import numpy as np
     import pyarrow as pa
+    import torch
 
     from irlcli.data.outputs import write_json
     from irlcli.data.parquet import write_table
@@ -79,6 +80,7 @@ def run(job: Job) -> None:
     from irlcli.report import scatter
     from irlcli.report.assessment import assess
 
+    torch.set_num_threads(1)
     p: Parameters = job.parameters
     model, origin = load_reward_file(job.inputs["reward"])
     episodes = {entry: _episodes(job, entry) for entry in p.bank}

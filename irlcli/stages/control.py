@@ -59,7 +59,7 @@ def run(job: Job) -> None:
     write_csv(job.output / "control.csv", summary)
     control.draw(job.output, summary)
     page = control.page(summary, choices, job.parameters.control)
-    (job.output / "README.md").write_text(page)
+    (job.output / "README.md").write_text(page, encoding="utf-8")
 
 
 STAGE = Stage("control", 2, run)

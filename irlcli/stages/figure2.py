@@ -78,7 +78,7 @@ def run(job: Job) -> None:
     from irlcli.envs.gridworld.env import walls
     from irlcli.interventions import env_kwargs, parse_setting
     from irlcli.report import figure2
-    from irlcli.tabular import intended_path, optimal_policy
+    from irlcli.tabular import backward, intended_path
 
     p: Parameters = job.parameters
     env = p.environment.name
@@ -92,7 +92,7 @@ def run(job: Job) -> None:
 
     def panel(variant: SweepVariant, title: str) -> figure2.Panel:
         reward = np.asarray(rewards[str(variant)])
-        policy, _ = optimal_policy(unseen, reward[None], grid.horizon)
+        policy, _ = backward(unseen, reward[None], grid.horizon)
         routes = {
             text: intended_path(mdp, policy[:, :, e, :, 0])
             for e, (text, mdp) in enumerate(zip(p.unseen, unseen.mdps, strict=True))
@@ -123,7 +123,9 @@ def run(job: Job) -> None:
         f"Fit: {m.iterations} iterations of RMSProp at learning rate {m.learning_rate:g}"
         + (f", the first {warmup} at lambda 0" if warmup else ""),
     ]
-    (job.output / "README.md").write_text(figure2.page(summary, differences, p.unseen, facts))
+    (job.output / "README.md").write_text(
+        figure2.page(summary, differences, p.unseen, facts), encoding="utf-8"
+    )
 
 
 STAGE = Stage("figure2", 5, run)

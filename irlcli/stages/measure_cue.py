@@ -43,6 +43,8 @@ def request(
 
 def run(job: Job) -> None:
     """Score every demonstrated step twice for each hint: with the hint at 1 and at -1."""
+    import torch
+
     from irlcli.data.demonstrations import read_demonstrations
     from irlcli.data.descriptions import CueContrast, HintContrast
     from irlcli.data.outputs import write_json
@@ -50,6 +52,7 @@ def run(job: Job) -> None:
     from irlcli.report.cue import hint_contrasts
     from irlcli.trajectories import transitions
 
+    torch.set_num_threads(1)
     p: Parameters = job.parameters
     demos = read_demonstrations(job.inputs["demonstrations"])
     demos.require(p.environment.name, p.settings)

@@ -165,12 +165,14 @@ def _write(
         write_csv(job.output / "variants.csv", report.variants)
         write_csv(job.output / "shares.csv", report.shares)
     write_json(job.output / f"{p.kind}.json", build.as_json(report))
-    (job.output / "README.md").write_text(page.markdown(p, report))
-    (job.output / f"{p.kind}.tex").write_text(page.latex(report))
+    (job.output / "README.md").write_text(page.markdown(p, report), encoding="utf-8")
+    (job.output / f"{p.kind}.tex").write_text(page.latex(report), encoding="utf-8")
     points_svg = plots.draw_points(job.output, p, report)
     banks = scatter.draw_banks(job.output, p, assessments)
     curves = plots.learning_curves(p, learning)
-    (job.output / f"{p.kind}.html").write_text(page.html(p, report, points_svg, banks, curves))
+    (job.output / f"{p.kind}.html").write_text(
+        page.html(p, report, points_svg, banks, curves), encoding="utf-8"
+    )
 
 
 def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:

@@ -66,7 +66,9 @@ def run(job: Job) -> None:
     caveats = experts.caveats(p.cells, numbers, p.bars)
     write_csv(job.output / "experts.csv", numbers)
     write_json(job.output / "experts.json", {"tables": [table._asdict()], "caveats": caveats})
-    (job.output / "README.md").write_text(experts.markdown(p.command, table, caveats))
+    (job.output / "README.md").write_text(
+        experts.markdown(p.command, table, caveats), encoding="utf-8"
+    )
     experts.draw(job.output, p.cells, learning)
 
 

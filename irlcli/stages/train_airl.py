@@ -78,6 +78,23 @@ def request(
             f"airl.ppo.n_envs = {airl.ppo.n_envs}: the worlds cannot be shared equally by {trained} settings",
             f"--set airl.ppo.n_envs to a multiple of {trained}",
         )
+    relevant = _relevant(airl, env, trained)
+    parameters = Parameters(
+        environment=environment_key(env, settings),
+        settings=texts,
+        seed=seed,
+        airl=relevant,
+        penalty_version=penalty_version(relevant.penalty),
+        selection_version=_selection_version(relevant),
+        dealing_version=2 if relevant.grouping == "shuffled" else UNSET,
+    )
+    check_risks(relevant.penalty, relevant.grouping, trained)
+    label = f"train-airl {describe(relevant)} {env} {', '.join(texts)} seed {seed}"
+    return Request(STAGE, parameters, {"demonstrations": demos, **(basis or {})}, label)
+
+
+def _relevant(airl: AIRLConfig, env: str, trained: int) -> AIRLConfig:
+    """The config as keys have it, checked against the environment and the number of settings."""
     spec = environment(env)
     if airl.symmetries is True and spec.symmetries is None:
         raise UsageError(f"airl.symmetries: {env} has no symmetries", "--set airl.symmetries=none")
@@ -95,18 +112,7 @@ def request(
             f"{trained} settings",
             f"--set airl.batch_size={2 * trained} or more",
         )
-    parameters = Parameters(
-        environment=environment_key(env, settings),
-        settings=texts,
-        seed=seed,
-        airl=relevant,
-        penalty_version=penalty_version(relevant.penalty),
-        selection_version=_selection_version(relevant),
-        dealing_version=2 if relevant.grouping == "shuffled" else UNSET,
-    )
-    check_risks(relevant.penalty, relevant.grouping, trained)
-    label = f"train-airl {describe(relevant)} {env} {', '.join(texts)} seed {seed}"
-    return Request(STAGE, parameters, {"demonstrations": demos, **(basis or {})}, label)
+    return relevant
 
 
 def name(airl: AIRLConfig) -> str:

@@ -106,7 +106,7 @@ def collect(
 ) -> tuple[list[Artefact], list[Path]]:
     """Remove :func:`garbage` and :func:`stale_work`; returns what was removed.
 
-    Temporary files of dead processes are removed too, whatever their age.
+    Temporary files of dead processes are removed too, those of other machines after a day.
 
     Raises:
         Busy: the store is in use.

@@ -106,7 +106,7 @@ def alive(pid: int) -> bool:
     """Whether a process of this machine has the id ``pid``."""
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         pass

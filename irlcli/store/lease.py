@@ -158,8 +158,8 @@ def read(path: Path) -> Holder | None:
         said = json.loads(text)
         host, where, token = (str(said[field]) for field in ("host", "machine", "token"))
         return Holder(path, touched, host, where, int(said["process"]), token)
-    except (ValueError, KeyError, TypeError):
-        # It is being written, or the disk was full.
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
+        # Cut short, or no lease.
         return Holder(path, touched)
 
 
@@ -192,7 +192,7 @@ def _create(path: Path, token: str) -> bool:
     # Linked when it is whole: the holder of an empty lease is unknown, and lives until it is stale.
     whole = path.with_name(unique_name(f".{path.name}"))
     try:
-        with open(whole, "x") as file, suppress(OSError):
+        with open(whole, "x") as file:
             file.write(json.dumps(said))
         os.link(whole, path)
     except FileExistsError:
@@ -255,6 +255,5 @@ def _beating(path: Path, token: str) -> Iterator[None]:
         yield
     finally:
         _HEART.remove(path)
-        # An empty one could not be filled, on a full disk.
-        if _token(path) in (token, ""):
+        if _token(path) == token:
             path.unlink(missing_ok=True)

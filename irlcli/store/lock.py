@@ -38,7 +38,9 @@ def locked(
     """
     # A shared lock needs no write permission, so readers of a read-only store can take it.
     access = os.O_RDONLY if shared else os.O_RDWR
-    descriptor = os.open(path, access | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+    # Opening a named pipe would wait for a writer.
+    flags = os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(path, access | flags, 0o666)
     try:
         mode = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
         problem = None

@@ -157,7 +157,7 @@ class Remote:
 
     def resolve(self, ref: str) -> references.Resolved:
         """What ``ref`` names: see :func:`irlcli.store.references.resolve`."""
-        head = ref.partition("/")[0]
+        head = ref.removeprefix(f"{layouts.DEFAULT_ROOT}/").partition("/")[0]
         found = [id16 for id16 in self.ids() if is_prefix(head) and id16.startswith(head[:16])]
         # All names, so that the nearest one can be suggested.
         found += [id16 for name, id16 in self.names().items() if name == head]

@@ -71,6 +71,13 @@ def test_runs_do_not_affect_each_other(name):
             assert torch.allclose(one[r], other[0], atol=1e-5)
 
 
+def test_a_penalty_of_the_parameters_that_is_not_registered_as_additive_fails(monkeypatch):
+    """Without its parameters it would be zero, and the control would report that it has no effect."""
+    monkeypatch.setitem(PENALTIES, "l2", PENALTIES["l2"]._replace(additive=False))
+    with pytest.raises(TypeError):
+        train(drawn((0.9,), [0]), Method("l2", 2.0), Schedule(4, 2, 1e-2), 0, [0])
+
+
 def test_ties_count_half():
     networks = Networks(2, 0, [0])
     with torch.no_grad():

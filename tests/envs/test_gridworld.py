@@ -207,12 +207,6 @@ def test_bad_settings_are_refused(arguments, message):
         gridworld(**arguments)
 
 
-def test_a_horizon_shorter_than_the_path_is_refused():
-    with pytest.raises(ValueError, match="10 steps away, the horizon only 9"):
-        expert_policy(gridworld(6), 9)
-    expert_policy(gridworld(6), 10)
-
-
 def test_observations_of_another_environment_are_refused():
     with pytest.raises(ValueError, match="2 numbers"):
         state_indices(np.zeros((3, 8), np.float32), 8)

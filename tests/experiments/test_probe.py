@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,6 +13,7 @@ from irlcli.errors import StageFailed, UsageError
 from irlcli.experiments.cluster.probe import look
 from irlcli.experiments.cluster.resources import Resources, parse_minutes
 from irlcli.experiments.cluster.slurm import Slurm
+from irlcli.store import Store
 
 
 @pytest.fixture
@@ -28,7 +30,8 @@ def probe(tmp_path, monkeypatch):
         warnings = []
         slurm = Slurm(Resources("P", cpus=3))
         (tmp_path / "runs").mkdir()
-        slurm.probe(tmp_path / "runs", lambda: None, warnings.append)
+        console = SimpleNamespace(say=lambda text: None, warn=warnings.append)
+        slurm.probe(Store(tmp_path / "runs"), console)
         assert list((tmp_path / "runs" / ".jobs").iterdir()) == []
         return warnings
 
@@ -136,12 +139,11 @@ def test_a_node_without_python(probe):
 
 
 def test_a_node_looks_for_the_token(tmp_path):
-    (tmp_path / ".jobs").mkdir()
     assert look(tmp_path, "token", tmp_path)["seen"] is False
-    (tmp_path / ".jobs" / "token").touch()
+    (tmp_path / "token").touch()
     assert look(tmp_path, "token", tmp_path).items() >= {"seen": True, "directory": True}.items()
     assert look(tmp_path, "token", tmp_path / "elsewhere")["directory"] is False
-    assert [path.name for path in (tmp_path / ".jobs").iterdir()] == ["token"]
+    assert [path.name for path in tmp_path.iterdir()] == ["token"]
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count, gap):
 def test_a_foreign_input_that_changes_after_planning_is_noticed(tmp_path):
     from irlcli.configs import load_config
     from irlcli.errors import IntegrityError
-    from irlcli.experiments.status import foreign_source
+    from irlcli.experiments.inputs import foreign_source
     from irlcli.interventions import parse_settings
     from irlcli.stages import evaluate
 

@@ -135,7 +135,8 @@ def test_an_episodes_reward_is_the_sum_over_its_horizon(absorbing):
     if absorbing:
         # No action is an action vector of zeros.
         steps += [float(model.reward(s_next[5:], torch.zeros(1, 4)))] * 7
-    assert scoring.episode_reward(model, data, absorbing) == pytest.approx(sum(steps), rel=1e-5)
+    found = scoring.episode_reward(model, data, absorbing, math.inf)
+    assert found == pytest.approx(sum(steps), rel=1e-5)
 
 
 def test_pool_draws_absorbing_states_as_often_as_stepping_shows_them():

@@ -210,7 +210,7 @@ def write_transitions(
         for piece in itertools.chain([first], stream):
             table = _table(piece, schema, names, done)
             file.write_table(table, row_group_size=len(piece))
-            done += int((piece.terminated | piece.truncated).sum())
+            done += int(piece.ended.sum())
 
 
 def _schema(first: Steps, env: str) -> pa.Schema:
@@ -230,10 +230,8 @@ def _schema(first: Steps, env: str) -> pa.Schema:
 
 
 def _table(steps: Steps, schema: pa.Schema, names: pa.Array, done: int) -> pa.Table:
-    ends = np.flatnonzero(steps.terminated | steps.truncated)
-    episode = done + np.searchsorted(ends, np.arange(len(steps)))
     arrays = (
-        episode.astype(np.int32),
+        steps.episode_numbers(done).astype(np.int32),
         steps.seeds,
         steps.observations,
         steps.actions,

@@ -28,9 +28,7 @@ class Goal:
         ValueError: both are given, a value is out of range, or the range is empty.
     """
 
-    def __init__(
-        self, goal_y: float | None = None, direction: float | Sequence[float] | None = None
-    ):
+    def __init__(self, goal_y: float | None, direction: float | Sequence[float] | None):
         if goal_y is not None and direction is not None:
             raise ValueError(
                 f"goal_y and direction exclude each other, not {goal_y!r} and {direction!r}"

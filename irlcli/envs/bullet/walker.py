@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from irlcli.envs.arguments import require
-from irlcli.envs.bullet.arguments import require_friction
-from irlcli.envs.bullet.body import Link, Vector, create_body
+from irlcli.envs.bullet.body import Link, Vector, create_body, single
 from irlcli.envs.bullet.goal import Goal
 from irlcli.envs.bullet.knobs import LEG_LENGTH, WALKER_KNOBS
 from irlcli.envs.bullet.robot import Robot
@@ -37,7 +38,7 @@ class Walker:
         direction: float | Sequence[float] | None,
     ):
         self.mass = require(WALKER_KNOBS["mass"], mass)
-        self.friction = require_friction(friction)
+        self.friction = _friction(friction)
         self.leg_length = require(LEG_LENGTH, leg_length)
         self.goal = Goal(goal_y, direction)
 
@@ -64,3 +65,21 @@ class Walker:
         if self.mass != 1.0:
             robot.scale_mass(self.mass)
         return robot
+
+
+def _friction(friction: Sequence[float]) -> Vector:
+    """The tangential, torsional and rolling coefficient in the importer's precision.
+
+    Raises:
+        ValueError: ``friction`` is not three numbers within the knob's bounds.
+    """
+    if np.shape(friction) != (3,):
+        raise ValueError(
+            f"friction must be three numbers (tangential, torsional, rolling), not {friction!r}"
+        )
+    kinds = ("tangential", "torsional", "rolling")
+    tangential, torsional, rolling = (
+        single(require(WALKER_KNOBS["friction"]._replace(argument=f"friction ({kind})"), value))
+        for kind, value in zip(kinds, friction, strict=True)
+    )
+    return tangential, torsional, rolling

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 
-from irlcli.tabular import TabularMDP, optimal_policy, shortest_path_length, stack, true_reward
+from irlcli.tabular import TabularMDP, backward, shortest_path_length, stack, true_reward
 from irlcli.trajectories import Trajectory
 
 Goal = Literal["terminal", "absorbing"]
@@ -143,10 +143,10 @@ def expert_policy(mdp: TabularMDP, horizon: int) -> np.ndarray:
     Equally good actions are equally likely.
 
     Raises:
-        ValueError: the goal is more steps away than the horizon.
+        ValueError: as :func:`irlcli.tabular.backward`.
     """
     settings = stack([mdp])
-    return optimal_policy(settings, true_reward(settings), horizon)[0][:, :, 0, :, 0]
+    return backward(settings, true_reward(settings), horizon)[0][:, :, 0, :, 0]
 
 
 def sample_trajectories(

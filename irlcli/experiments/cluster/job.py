@@ -66,7 +66,11 @@ class StepJob(NamedTuple):
             if code != Busy.exit_code:
                 # Otherwise the last lines say who else works on it.
                 lines.append(f"error: {self.name} was interrupted {turns + 1} times")
-                lines.append("hint: run the same command again: it resumes, with a new count")
+                lines.append(
+                    "hint: give the jobs more time (--time), then run the same command again: it resumes"
+                )
+                # A process that a signal killed has another code, whose message would replace these.
+                code = Interrupted.exit_code
         note.write_text(json.dumps(failure(code, lines)._asdict()))
         raise StepFailed(f"{self.name} ended with exit code {code}")
 

@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import records
 from irlcli.experiments.cluster.resources import Resources
+from irlcli.experiments.runner import RunConsole
 from irlcli.store import Store
 
 
@@ -70,5 +71,5 @@ class Local:
                 with suppress(ProcessLookupError):
                     os.kill(int(job), signal.SIGTERM)
 
-    def probe(self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]) -> None:
+    def probe(self, store: Store, console: RunConsole) -> None:
         """Jobs of this machine see what it sees."""

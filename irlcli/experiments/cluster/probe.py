@@ -1,6 +1,6 @@
 """What a node sees of the store: run there before anything is submitted.
 
-``python -m irlcli.experiments.cluster.probe STORE TOKEN DIRECTORY`` prints a JSON document.
+``python -m irlcli.experiments.cluster.probe JOBS TOKEN DIRECTORY`` prints a JSON document.
 """
 
 import json
@@ -11,19 +11,22 @@ import time
 from pathlib import Path
 
 
-def look(store: Path, token: str, directory: Path) -> dict[str, object]:
-    """The facts about the node that can make jobs fail, or give other results."""
-    seen = (store / ".jobs" / token).exists()
+def look(jobs: Path, token: str, directory: Path) -> dict[str, object]:
+    """The facts about the node that can make jobs fail, or give other results.
+
+    ``jobs`` is the store's directory of submissions, which holds a file ``token``.
+    """
+    seen = (jobs / token).exists()
     facts: dict[str, object] = {"host": os.uname().nodename, "time": time.time(), "seen": seen}
     facts["directory"] = directory.is_dir()
     if seen:
-        own = store / ".jobs" / f"{token}.node"
+        own = jobs / f"{token}.node"
         try:
             own.write_text(os.uname().nodename)
             own.unlink()
         except OSError as error:
             facts["problem"] = error.strerror
-        facts["free"] = shutil.disk_usage(store).free
+        facts["free"] = shutil.disk_usage(jobs).free
     return facts
 
 

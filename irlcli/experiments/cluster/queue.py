@@ -1,12 +1,13 @@
 """A place that runs jobs, and which steps of a plan are in it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.records import Record, records
 from irlcli.experiments.plan import Plan
+from irlcli.experiments.runner import RunConsole
 from irlcli.store import Store
 
 
@@ -35,9 +36,7 @@ class Queue(Protocol):
 
     def cancel(self, ids: Iterable[str]) -> None: ...
 
-    def probe(
-        self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]
-    ) -> None: ...
+    def probe(self, store: Store, console: RunConsole) -> None: ...
 
 
 class Queued(NamedTuple):

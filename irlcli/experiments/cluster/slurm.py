@@ -16,6 +16,8 @@ from typing import Any
 from irlcli.errors import StageFailed, UsageError
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.resources import Resources
+from irlcli.experiments.runner import RunConsole
+from irlcli.store import Store
 
 JOB_NAME = "irl"
 _CLOCK_SECONDS = 60.0
@@ -145,7 +147,7 @@ class Slurm:
                 "the other jobs are cancelled; whoever submitted a job can cancel it",
             )
 
-    def probe(self, store: Path, waiting: Callable[[], None], warn: Callable[[str], None]) -> None:
+    def probe(self, store: Store, console: RunConsole) -> None:
         """Run a job that looks at the store from a node, and wait for it.
 
         Raises:
@@ -154,8 +156,8 @@ class Slurm:
                 does not see the working directory.
         """
         token = f"probe-{os.urandom(8).hex()}"
-        (store / ".jobs").mkdir(exist_ok=True)
-        (store / ".jobs" / token).touch()
+        store.jobs.mkdir(exist_ok=True)
+        (store.jobs / token).touch()
         command = ["srun", "--ntasks=1", "--time=2", f"--job-name={JOB_NAME}-probe"]
         command += [
             *self._resources.words(),
@@ -164,44 +166,48 @@ class Slurm:
             "-m",
             "irlcli.experiments.cluster.probe",
         ]
-        waiting()
+        console.say("a probe job checks the store from a node")
         try:
             before = time.time()
             printed, errors = _allocate(
-                [*command, str(store.resolve()), token, str(Path.cwd())],
-                lambda why: warn(f"Slurm does not start the probe job: {why}"),
+                [*command, str(store.jobs.resolve()), token, str(Path.cwd())],
+                lambda why: console.warn(f"Slurm does not start the probe job: {why}"),
             )
             after = time.time()
         finally:
-            (store / ".jobs" / token).unlink(missing_ok=True)
+            (store.jobs / token).unlink(missing_ok=True)
         try:
             facts = json.loads(printed.splitlines()[-1])
         except (IndexError, ValueError):
             raise _refused(errors) from None
-        where = f"the node {facts['host']}"
-        if not facts["seen"]:
-            raise StageFailed(
-                f"{where} does not see the store {store.resolve()}",
-                "put the store on a file system that the nodes share (--store)",
-            )
-        if not facts["directory"]:
-            raise StageFailed(
-                f"{where} does not see the working directory {Path.cwd()}",
-                "run the command in a directory on a file system that the nodes share",
-            )
-        if "problem" in facts:
-            raise StageFailed(
-                f"{where} cannot write to {store.resolve()}: {facts['problem']}",
-                "make room or change its permissions, then run the same command again",
-            )
-        ahead = max(facts["time"] - after, before - facts["time"])
-        if ahead > _CLOCK_SECONDS:
-            warn(
-                f"the clock of {where} differs by {ahead:.0f} s from this machine's: gc's grace "
-                "period and the times in provenance are off by as much"
-            )
-        if facts["free"] < _LOW_BYTES:
-            warn(f"the store's disk has {facts['free'] >> 20} MiB left")
+        _judge(facts, max(facts["time"] - after, before - facts["time"]), store, console)
+
+
+def _judge(facts: dict[str, Any], clock: float, store: Store, console: RunConsole) -> None:
+    """Refuse a node that cannot make the jobs; warn of one whose clock differs by ``clock`` [s]."""
+    where = f"the node {facts['host']}"
+    if not facts["seen"]:
+        raise StageFailed(
+            f"{where} does not see the store {store.root.resolve()}",
+            "put the store on a file system that the nodes share (--store)",
+        )
+    if not facts["directory"]:
+        raise StageFailed(
+            f"{where} does not see the working directory {Path.cwd()}",
+            "run the command in a directory on a file system that the nodes share",
+        )
+    if "problem" in facts:
+        raise StageFailed(
+            f"{where} cannot write to {store.root.resolve()}: {facts['problem']}",
+            "make room or change its permissions, then run the same command again",
+        )
+    if clock > _CLOCK_SECONDS:
+        console.warn(
+            f"the clock of {where} differs by {clock:.0f} s from this machine's: gc's grace "
+            "period and the times in provenance are off by as much"
+        )
+    if facts["free"] < _LOW_BYTES:
+        console.warn(f"the store's disk has {facts['free'] >> 20} MiB left")
 
 
 def _refused(errors: str) -> UsageError | StageFailed:

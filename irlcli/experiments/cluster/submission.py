@@ -75,13 +75,13 @@ class Submission:
         self._signals = 0
         self._outcome = Outcome()
 
-    def submit(self, waiting: Callable[[], None], warn: Callable[[str], None]) -> int:
+    def submit(self) -> int:
         """Submit what is missing and not in the queue; returns how many jobs that are.
 
         Raises:
             UsageError, StageFailed: Slurm refuses the jobs, or a node cannot use the store.
         """
-        store = self._runner.store
+        store, console = self._runner.store, self._runner.console
         self._take_what_exists()
         missing = [name for name in self._plan.tasks if not self._exists(name)]
         self._display.begin(len(self._plan.tasks), len(self._plan.tasks) - len(missing))
@@ -89,13 +89,13 @@ class Submission:
             return 0
 
         def wait_for(holder: str) -> None:
-            warn(f"waiting for {holder}, which submits jobs for this store")
+            console.warn(f"waiting for {holder}, which submits jobs for this store")
 
         with store.working_on(LOCK, wait=True, on_wait=wait_for):
             new = self._find_queued(missing)
             if not new:
                 return 0
-            self._queue.probe(store.root, waiting, warn)
+            self._queue.probe(store, console)
             # The probe may have waited for hours.
             new = self._find_queued(missing)
             absent = set(missing)
@@ -133,7 +133,7 @@ class Submission:
                     answered = time.monotonic()
                     self._poll(states, answered)
                     if not self._alive:
-                        if not self._any_ready():
+                        if not any(map(self._ready, self._unstarted())):
                             break
                         continue
                 self._pause(time.monotonic() - self._started)
@@ -230,9 +230,6 @@ class Submission:
         """The steps that wait for others, or for a free place."""
         handled = {*self._ids, *self._outcome.made}
         return [name for array in self._waiting for name in array.names if name not in handled]
-
-    def _any_ready(self) -> bool:
-        return any(map(self._ready, self._unstarted()))
 
     def _ready(self, name: str) -> bool:
         return all(self._exists(need) for need in self._plan.needs[name])
