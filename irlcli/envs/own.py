@@ -245,7 +245,8 @@ def _check_name(name: str) -> None:
         )
     if name in ENVIRONMENTS:
         raise UsageError(
-            f"{name!r} is a built-in environment", "rename the file, or write name = ... in [env]"
+            f"{name!r} is the name of another environment",
+            "rename the file, or write name = ... in [env]",
         )
 
 

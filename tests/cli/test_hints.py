@@ -402,6 +402,14 @@ def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):
     assert done.code == 0 and "reads --set" not in done.err
 
 
+def test_a_bad_name_fails_before_the_choice_of_lambda(irl, store_copy):
+    line = ["train-airl", "--demos", "demos", "--method", "irm", "--choose-penalty", "0.1,1"]
+    before = set(store_copy.path.iterdir())
+    done = irl(*line, "--name", "12ab", *SMOKE, "--seed", 9, "--store", store_copy.path)
+    assert done.code == 2 and "12ab" in done.err and "RUN" not in done.err
+    assert set(store_copy.path.iterdir()) == before
+
+
 def test_a_line_that_is_wrong_can_be_completed():
     group = typer.main.get_command(app)
     context = group.make_context("irl", ["plan"], resilient_parsing=True)

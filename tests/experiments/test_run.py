@@ -16,6 +16,7 @@ import pytest
 from test_architecture import loaded_by
 
 from irlcli.configs import load_config
+from irlcli.errors import StageFailed
 from irlcli.experiments.execute import Execution, Outcome
 from irlcli.experiments.failures import Failure
 from irlcli.experiments.runner import Runner, Silent
@@ -356,6 +357,27 @@ def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):
     outcome = Execution(plan, session.runner(), command, 1, Unseen()).run()
     assert outcome.exit_code == 0 and outcome.made[-1] == reward
     assert plan.tasks[reward].request.parameters.airl.penalty_weight == 10.0
+
+
+def test_a_copy_that_fails_does_not_end_other_steps(tmp_path):
+    """The process that is started instead copies, or says what is wrong."""
+    tables = tmp_path / "tables.toml"
+    tables.write_text(TABLES)
+    line = {"profile": "smoke", "file": None, "overrides": [], "sources": [], "command": ["irl"]}
+    session = StageSession(tmp_path / "runs", Silent(), **line)
+    session.store.create()
+    plan = open_plan(session, TableChoice("tiny", until="experts", tag="smoke", file=tables))
+    runner = session.runner()
+
+    def copy(request, lookup):
+        raise StageFailed("the connection was lost", "run the same command again")
+
+    runner.copy = copy
+    step = plan.step
+    plan.step = lambda name: step(name)._replace(status="FOUND")
+    outcome = Execution(plan, runner, lambda name: [sys.executable, "-c", ""], 2, Unseen()).run()
+    assert len(outcome.failed) == 3 and not outcome.copied
+    assert {failure.code for failure in outcome.failed.values()} == {1}
 
 
 class Unseen:

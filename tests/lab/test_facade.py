@@ -171,6 +171,14 @@ def test_an_uncertain_verdict_and_a_malformed_assessment_of_another_store(tmp_pa
         table(document | {"bank": 7}, 1)
 
 
+def test_a_recording_is_a_table_of_one_setting(tmp_path, publish):
+    means = {"setting": "mass=4x", "episodes": 2, "mean_return": 3.0}
+    store = Store(tmp_path / "runs")
+    made = publish(store, {"summary.json": json.dumps(means).encode()}, stage="record")
+    table = irlcli.Lab(store.root).artefact(made.artefact.id).to_pandas()
+    assert table.to_dict("records") == [means]
+
+
 def test_settings_may_be_lists(lab):
     both = lab.evaluate(idle=True, env="lunar-lander", ood=["engine-power=1.5x", "2x"])
     assert [one.id for one in both] == [

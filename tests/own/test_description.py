@@ -110,7 +110,7 @@ WRONG = [
     ('id = "cart:Cart-v0"', 'id = "c art:Cart-v0"', 2, "'c art:Cart-v0'", "module:EnvId"),
     ('id = "cart:Cart-v0"', 'id = "crat:Cart-v0"', 3, "no module 'crat'", "crat.py"),
     ('id = "cart:Cart-v0"', 'entry_point = "Cart"', 2, "env.entry_point: 'Cart'", "module:Class"),
-    ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nname = "ant"', 2, "'ant' is a built-in", "name"),
+    ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nname = "ant"', 2, "'ant' is the name of another", "name"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nname = "a b"', 2, "'a b'", "letters"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["x.xml"]', 3, "'x.xml'", "relative"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["../x"]', 2, "'../x'", "below"),

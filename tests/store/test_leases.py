@@ -100,6 +100,32 @@ def test_a_lease_is_kept_alive(empty_store, leases, monkeypatch):
         assert lease.read(path).lives(locks_work=False)
 
 
+@pytest.mark.parametrize(
+    "text", ["[" * 1000, '{"host": "a", "machine": "b", "process": 1e999, "token": "c"}', "7", ""]
+)
+def test_a_file_that_is_no_lease_ends_no_command(empty_store, leases, text):
+    path = leases / f"{KEY}.claim"
+    path.write_text(text)
+    with pytest.raises(Busy):
+        work(empty_store)
+    os.utime(path, (0, 0))
+    work(empty_store)
+
+
+def test_a_process_that_cannot_exist_is_dead(empty_store, leases):
+    foreign(
+        leases / f"{KEY}.claim", host=os.uname().nodename, machine=lease.machine(), process=10**20
+    )
+    work(empty_store)
+
+
+def test_a_named_pipe_is_no_lock(empty_store):
+    path = empty_store.root / ".locks" / "gc"
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    work(empty_store)
+
+
 def test_whoever_lost_a_lease_leaves_the_new_one_alone(empty_store, leases):
     with empty_store.working_on(KEY, wait=False):
         foreign(leases / f"{KEY}.claim")

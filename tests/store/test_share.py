@@ -212,6 +212,12 @@ def test_a_killed_pull_publishes_whole_artefacts_and_is_repeated(store, chain, u
     assert limit > 100
 
 
+def test_a_path_of_the_default_store_names_the_same_behind_a_url(store, chain, url):
+    push(store, url, chain["airl"])
+    for ref in ("irm-0", chain["airl"].id, f"runs/{chain['airl'].id}"):
+        assert open_place(url, pytest.fail).resolve(ref).artefact.id == chain["airl"].id
+
+
 def test_two_pushes_at_once(store, chain, url, monkeypatch):
     """The second one starts and ends while the first writes each of its files."""
     write, active = Remote._write, False
