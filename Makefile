@@ -94,7 +94,7 @@ experts figure2 control: $(READY)
 	$(IRL) run $@ $(OPTIONS) --out $(RESULTS)
 
 report-%: $(READY)
-	$(IRL) report $* $(CHOSEN) --out results/$(or $(TAG),$(PROFILE))/$*$(PART)
+	$(IRL) report $* $(CHOSEN) --out $(patsubst %/$@$(PART),%/$*$(PART),$(RESULTS))
 
 # The values of settings/*.toml; needs no store.
 table2: $(READY)

@@ -46,7 +46,12 @@ _Until = Annotated[
     ),
 ]
 _Only = Annotated[str | None, typer.Option(metavar="NAME", help="One step and what it needs.")]
-_Tag = Annotated[str | None, typer.Option(help="Prefix of all names. Default: the profile.")]
+_Tag = Annotated[
+    str | None,
+    typer.Option(
+        help="Prefix of all names. Default: the profile, or the name of a table that has settings of its own."
+    ),
+]
 TableFile = Annotated[
     Path | None,
     typer.Option("--experiments", help="File with the tables. Default: settings/experiments.toml."),

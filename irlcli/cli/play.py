@@ -41,7 +41,9 @@ def play(
             "the policy was trained on."
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps to draw.")] = 300,
+    steps: Annotated[
+        int, typer.Option(min=1, help="Maximum number of steps to draw in each setting.")
+    ] = 300,
     env: Env = None,
     seed: Seed = 0,
 ) -> None:

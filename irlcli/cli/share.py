@@ -41,7 +41,7 @@ def push(
 ) -> None:
     """Copy artefacts and all they were made from to a directory or URL.
 
-    What is there already is skipped. Their names go with them.
+    Artefacts that the destination already has are skipped. Names are copied, too.
     """
     from irlcli.store.sources import open_place
 
@@ -62,7 +62,8 @@ def pull(
 ) -> None:
     """Copy artefacts and all they were made from out of a directory or URL.
 
-    What is here already is skipped. Names come with them; a name that is in use here stays.
+    Artefacts that this store already has are skipped. Names are copied, too; a name that already
+    exists here keeps its artefact.
     """
     from irlcli.store.sources import open_sources
 

@@ -23,7 +23,7 @@ _PenaltyWeight = Annotated[float | None, typer.Option(help="Weight of the penalt
 
 
 def _listed(learner: str) -> str:
-    return f"Invariance penalty: {', '.join(complete.penalties(learner))}."
+    return f"Penalty: {', '.join(complete.penalties(learner))}."
 
 
 @stage_command

@@ -9,7 +9,7 @@ SPEC = EnvironmentSpec(
     max_episode_steps=32,
     knobs={
         "path-group": Knob(
-            "path_group", ("absolute",), 0, 3, "the open gate, 0 for no gates", whole=True
+            "path_group", ("absolute",), 0, 3, "the open gate; 0: no wall", whole=True
         ),
         "blocked": Knob(
             "blocked", ("absolute",), 0, 2, "how many groups' paths are barred", whole=True
