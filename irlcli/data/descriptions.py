@@ -178,6 +178,11 @@ class Subject(Struct, frozen=True, kw_only=True):
     from_student: bool = False
     restarts: tuple[Finite, ...] = ()
 
+    @property
+    def learning_seed(self) -> int | None:
+        """The seed that comparisons use: of the reward learning, or of a policy without a reward."""
+        return self.seed if self.reward_seed is None else self.reward_seed
+
 
 class Returns(Struct, frozen=True, kw_only=True):
     """Mean returns in one setting; the learned return is the mean of g / scale per episode."""

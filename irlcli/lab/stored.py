@@ -61,8 +61,9 @@ class Stored:
         """The table that the stage leaves, or another one of its ``.parquet`` outputs.
 
         A row per setting of demonstrations or of a recording (``summary.json``) and of a MaxEnt reward
-        (``quality.json``), per agent and setting of an evaluation, per policy and setting of an
-        assessment, and per round and setting of any other training (``metrics.parquet``).
+        (``quality.json``), per agent and setting of an evaluation (``seed`` is that of the reward
+        learning), per policy and setting of an assessment, and per round and setting of any other
+        training (``metrics.parquet``).
 
         Raises:
             UsageError: it leaves none, or ``output`` is not in Parquet.
@@ -73,7 +74,11 @@ class Stored:
 
         store, artefact = self._session.store, self._artefact
         if output is None and self.stage == "evaluate":
-            return pd.DataFrame(as_json([measured(self._session, artefact)]))
+            run = measured(self._session, artefact)
+            policy = run[0].policy
+            return pd.DataFrame(as_json([run])).assign(
+                method=policy.method, seed=policy.learning_seed
+            )
         if output is None and self.stage == "assess":
             found = references.output(store, artefact, "assessment.json", Assessment)
             return pd.DataFrame(_bank(found))

@@ -86,7 +86,7 @@ def rows(evaluations: Iterable[EvaluationRun]) -> list[AgentRow]:
         order = _ORDER.index(policy.agent)
         for item in summary.settings:
             agent = agent_name(policy, item.setting)
-            seeds = [policy.seed if policy.reward_seed is None else policy.reward_seed]
+            seeds = [policy.learning_seed]
             if reward is not None and not own:
                 agent += f" under {title(reward.method)}'s reward"
                 seeds.append(reward.seed)

@@ -112,6 +112,9 @@ def test_tables_are_data_frames(lab, irl, store_copy):
     assert list(demos.to_pandas()["setting"]) == ["engine-power=1x", "engine-power=1.25x"]
     assert {"round", "setting", "cross_entropy"} <= set(airl.to_pandas())
     assert score.to_pandas()["setting"].tolist() == ["engine-power=1.5x"]
+    (row,) = score.to_pandas()[["method", "seed"]].to_dict("records")
+    origin = json.loads(airl.output("reward.json").read_text())
+    assert row == {"method": origin["method"], "seed": origin["seed"]}
     assert len(score.to_pandas("episodes.parquet")) == score.to_pandas()["episodes_per_seed"][0]
     with pytest.raises(UsageError, match=r"reward\.pt"):
         airl.to_pandas("reward.pt")
