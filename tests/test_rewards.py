@@ -286,6 +286,15 @@ def test_discrete_actions_work_too(tmp_path):
             reward(still, [index], still, [False])
 
 
+def test_the_discount_is_by_default_that_of_the_reward_learning(tmp_path):
+    path, _ = write_random_reward(tmp_path, "lunar-lander", fixed_horizon=True, actions="sampled")
+    plain, own, other = (
+        irlcli.load_reward(path, **given)(*steps("lunar-lander", 50))
+        for given in ({}, {"gamma": 0.9}, {"gamma": 0.75})
+    )
+    assert np.array_equal(plain, own) and not np.array_equal(own, other)
+
+
 def test_an_environment_of_other_spaces_is_refused_before_its_first_step(tmp_path):
     path, _ = write_random_reward(tmp_path, "half-cheetah", fixed_horizon=False)
     reward = irlcli.load_reward(path)

@@ -200,5 +200,8 @@ def _record(job: Job, found: Iterable[list[Trajectory]], metadata: Mapping[str, 
 # The command compares experts with their bar.
 STAGE = Stage("collect-experts", 2, run, reads=("demonstrations", "expert.bar"))
 TABULAR_STAGE = Stage(
-    "collect-experts", 2, run_tabular, reads=("demonstrations.episodes", "gridworld")
+    "collect-experts",
+    2,
+    run_tabular,
+    reads=("demonstrations.episodes", "expert.bar", "gridworld"),
 )

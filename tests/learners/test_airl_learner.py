@@ -227,11 +227,21 @@ def test_the_learners_seed_deals_the_episodes_out(demos, monkeypatch):
     assert dealt[0] != dealt[1] == dealt[2]
 
 
-def test_every_grouping_draws_as_many_samples(demos, monkeypatch):
+@pytest.mark.parametrize(
+    ("pairing", "met"), [("matched", [{5.0}, {6.0}]), ("pooled", [{5.0, 6.0}, {5.0, 6.0}])]
+)
+def test_a_minibatch_is_as_large_and_paired_as_the_config_says(demos, monkeypatch, pairing, met):
     drawn = record_losses(monkeypatch)
-    for grouping in ("pooled", "balanced", "per-setting", "shuffled"):
-        updated(demos, grouping=grouping)
-    assert len({batch.log_probs.numel() for batch, _, _ in drawn}) == 1
+    changes = {**IRM, "pairing": pairing, "batch_size": 96, "replay_share": 0.0}
+    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, fixed_horizon=False, **changes)
+    rollouts = [
+        moved(moved(rollout, 5.0, slice(4)), 6.0, slice(4, 8))
+        for rollout in trainer.train_round(0, learner)
+    ]
+    learner.update(0, rollouts, trainer.policy)
+    batch = drawn[0][0]
+    assert batch.log_probs.shape == (2, 2, 96)
+    assert [set(part[0].unique().tolist()) for part in batch.observations] == met
 
 
 def test_a_student_begins_as_a_clone_of_all_experts(demos):

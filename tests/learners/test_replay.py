@@ -10,7 +10,7 @@ from irlcli.data.tensors import from_bytes, to_bytes
 from irlcli.learners.pools import make_pool
 from irlcli.learners.replay import Replay, starts_by, whole_episodes
 from irlcli.learners.reward_model import RewardModel
-from irlcli.trajectories import Transitions
+from irlcli.trajectories import Rollout, Transitions
 
 
 def episode(length, value, horizon=10):
@@ -29,6 +29,29 @@ def joined(episodes):
 
     numbers = np.concatenate([np.full(len(e), k) for k, e in enumerate(episodes)])
     return join(episodes), numbers
+
+
+def test_a_round_holds_the_episodes_that_begin_a_horizon_before_its_end():
+    """12 steps, horizon 4; episodes begin at 0, 4, 8, 9 and 11."""
+    ended = np.zeros((12, 1), bool)
+    ended[[3, 7, 8, 10]] = True
+    at = np.arange(12, dtype=np.float32).reshape(12, 1)
+    zero = np.zeros((12, 1))
+    rollout = Rollout(
+        observations=at[..., None],
+        actions=zero.astype(np.int64),
+        next_observations=at[..., None],
+        log_probs=zero,
+        true_rewards=zero,
+        terminated=ended,
+        truncated=np.zeros_like(ended),
+        lengths=ended.astype(np.int64),
+        returns=zero,
+        progress=zero,
+        errors=(),
+    )
+    data, _ = whole_episodes([rollout], np.ones(1, bool), 4)
+    assert data.observations.ravel().tolist() == list(range(9))
 
 
 def test_starts_by_keeps_the_episodes_that_began_in_time():

@@ -55,6 +55,20 @@ def test_absent_policies_do_not_count():
     assert spearman(true, learned, here) == pytest.approx(1.0)
 
 
+def test_intervals_resample_episodes_and_keep_their_two_returns_together():
+    """Two policies: the correlation is 1 or -1 in each resample."""
+    noise = np.array([-9.0, 9.0, -8.0, 8.0])
+
+    def low(true):
+        members = [
+            Member(f"{i}", "clone", "e", i + true, i + noise, np.ones(4)) for i in (0.0, 1.0)
+        ]
+        return agreement(members).pearson.low
+
+    assert low(0.0 * noise) == pytest.approx(-1.0)
+    assert low(noise) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_both_correlations_equal_scipys(seed):
     rng = np.random.default_rng(seed)

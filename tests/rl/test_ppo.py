@@ -158,6 +158,13 @@ def test_linear_schedules_fall_to_zero():
     assert bonuses == pytest.approx(PPO.ent_coef * remaining)
 
 
+@pytest.mark.parametrize(("kind", "half"), [("constant", 0.13), ("linear", 0.065)])
+def test_the_clip_range_is_that_of_the_config(kind, half):
+    model = make_trainer(clip_range=0.13, clip_range_schedule=kind).model
+    # Half of the training is left.
+    assert model.clip_range(0.5) == pytest.approx(half)
+
+
 def test_policies_survive_saving():
     trainer = make_trainer()
     trainer.train_round(0, TrueReward())

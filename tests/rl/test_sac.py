@@ -1,5 +1,6 @@
 """Rounds of SAC: what its replay holds, seeds, resuming, saved policies."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -45,6 +46,18 @@ def make_trainer(seed=0, worlds=None, **changes):
     sac = SACConfig(**{**SAC, **changes})
     worlds = worlds or make_worlds("reacher", SETTINGS, sac.n_envs)
     return SACTrainer(worlds, sac, 1000, seed, "test")
+
+
+class Strong(Falling):
+    action_space = gymnasium.spaces.Box(-4.0, 2.0, (1,), np.float32)
+
+
+def test_the_replay_holds_actions_in_units_of_their_bounds():
+    trainer = make_trainer(worlds=VectorWorlds([Strong(), Strong()], 50), n_steps=20)
+    acted = np.concatenate([r.actions for r in trainer.train_round(0, TrueReward())])
+    held = trainer.model.replay_buffer.actions[:20]
+    np.testing.assert_allclose(held, (acted + 1.0) / 3.0, atol=1e-6)
+    assert acted.min() < -1.5
 
 
 def test_random_actions_come_first():

@@ -1,16 +1,19 @@
 """The positive controls through the command line, at the smoke profile."""
 
 import csv
-import json
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from msgspec.structs import replace
 
 from irlcli.configs import load_config
-from irlcli.errors import UsageError
+from irlcli.controls import cued_fits
+from irlcli.controls.classifier import Schedule, accuracy, train
+from irlcli.controls.cued_labels import UNIT_TESTS, permuted, unit_test
+from irlcli.controls.variants import Method
 from irlcli.experiments.runner import Runner
-from irlcli.stages import control, control_maps
+from irlcli.stages import control, control_labels, control_maps
 from irlcli.stages.base import Job
 from irlcli.stages.control_labels import methods
 
@@ -143,17 +146,37 @@ def test_every_seed_has_a_row_for_each_setting_left_out(store):
     assert all((row["held_out_risk"] is None) == (row["left_out"] < 0) for row in rows)
 
 
-def test_a_case_with_two_colours_draws_their_strengths():
+def test_cases_have_the_strengths_of_the_config():
     cases = {case.name: case for case in control_maps.cases(SMOKE.maps)}
     assert cases["settings.3.colours.1"].strengths == (0.95, 0.8, 0.65)
     assert cases["settings.3.colours.2"].colours == 2
     assert cases["gap.0.1"].strengths == (0.925, 0.825)
-    json.dumps([case.name for case in cases.values()])
 
 
-def test_fewer_than_two_settings_are_refused_by_every_part():
-    from msgspec.structs import replace
+def test_two_colours_have_strengths_of_their_own_in_every_seed(monkeypatch):
+    (case,) = (c for c in control_maps.cases(SMOKE.maps) if c.name == "settings.3.colours.2")
+    drawn, original = [], cued_fits.dataset
 
-    with pytest.raises(UsageError, match="need two") as refused:
-        control.request(replace(SMOKE, maps=replace(SMOKE.maps, strengths=(0.9,))))
-    assert "control.maps.choices" in refused.value.hint
+    def dataset(maps, strengths, seeds):
+        drawn.append(strengths.copy())
+        return original(maps, strengths, seeds)
+
+    monkeypatch.setattr(cued_fits, "dataset", dataset)
+    control_maps._rows(case, SMOKE.maps)
+    (strengths,) = drawn
+    assert len(np.unique(strengths)) == strengths.size
+    assert strengths.min() >= 0.65 and strengths.max() <= 0.95
+
+
+def test_the_oracle_learns_from_inputs_that_tell_nothing_false(store):
+    labels = SMOKE.labels
+    seeds = range(labels.seeds)
+    trained, unseen = unit_test(UNIT_TESTS["example 2"], seeds, labels.unit_samples)
+    schedule = Schedule(labels.unit_steps, labels.unit_steps // 4, labels.learning_rate)
+    oracle = permuted(trained.numpy(), seeds)
+    networks = train(oracle, Method(oracle=True), schedule, 0, seeds)
+    made = Runner(store).run(control_labels.request("example 2", labels))
+    rows = pq.read_table(made.directory / "accuracy.parquet").to_pylist()
+    for name, samples in (("trained", trained), ("unseen", unseen)):
+        found = [row[name] for row in rows if row["method"] == "oracle"]
+        assert found == pytest.approx(accuracy(networks, samples).mean(1).tolist())

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from test_architecture import loaded_by
@@ -19,12 +20,14 @@ from irlcli.configs import load_config
 from irlcli.data import tensors as checkpoints
 from irlcli.data.demonstrations import read_demonstrations
 from irlcli.data.descriptions import TabularReward
+from irlcli.envs.gridworld import tasks
 from irlcli.envs.gridworld.env import gridworld
 from irlcli.envs.gridworld.tasks import usable_input
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.experiments.runner import Runner
 from irlcli.interventions import parse_settings
+from irlcli.learners import tabular_quality
 from irlcli.stages import collect_experts, figure2, sweep_maxent, train_maxent
 from irlcli.stages.base import From
 from irlcli.stages.sweep_maxent import variants
@@ -98,11 +101,13 @@ def test_grid_and_seed_are_part_of_the_identity(run, demos):
     assert f"{demos}\n" in ids
 
 
-def test_an_expert_below_its_bar_is_named(run):
-    arguments = ["--env", "gridworld", "--intervention", "path-group=2", "--set", "expert.bar=-1"]
-    done = run("collect-experts", *arguments)
-    assert done.code == 0
-    assert "path-group=2" in done.err and "bar" in done.err
+@pytest.mark.parametrize(("bar", "missed"), [("-1", True), ("-100", False)])
+def test_an_expert_below_its_bar_is_named(run, bar, missed):
+    line = ["--env", "gridworld", "--intervention", "path-group=2", "--set", f"expert.bar={bar}"]
+    done = run("collect-experts", *line)
+    warned = [text for text in done.err.splitlines() if text.startswith("warning")]
+    assert done.code == 0 and len(warned) == missed
+    assert all("path-group=2" in text and f"bar {bar}" in text for text in warned)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=" ".join)
@@ -142,8 +147,51 @@ def test_shuffled_labels_that_reveal_the_settings_are_named(run, episodes, revea
     assert ("warning: shuffled labels" in done.err) == reveals
 
 
-def test_methods_differ(run, demos):
-    assert len({run("train-maxent", "--demos", "demos", *m).out for m in METHODS}) == len(METHODS)
+def test_methods_learn_different_rewards(run, demos):
+    rewards = set()
+    for method in METHODS:
+        made = Path(run("train-maxent", "--demos", "demos", *method).out.strip())
+        _, tensors = checkpoints.load(made / "reward.pt", "tabular-reward")
+        rewards.add(tensors["reward"].numpy().tobytes())
+    assert len(rewards) == len(METHODS)
+
+
+def test_rewards_are_judged_by_episodes_of_no_dataset(monkeypatch):
+    judged, original = [], tabular_quality.assess
+    monkeypatch.setattr(
+        tabular_quality, "assess", lambda *given: judged.append(given[3]) or original(*given)
+    )
+    grid = load_config("gridworld", "smoke").gridworld
+    list(train_maxent.judge(GROUPS, [], grid, np.zeros((1, 25)), 10))
+    for seed in range(5):
+        for e, text in enumerate(GROUPS):
+            trained = tasks.sample(text, grid, 10, (seed, e))
+            held_out = judged[0].actions[e]
+            assert not all(
+                np.array_equal(actions, episode.actions[: len(actions)])
+                for actions, episode in zip(held_out, trained, strict=True)
+            )
+
+
+def test_a_sweep_holds_the_rewards_that_train_maxent_learns(store):
+    config, runner = load_config("gridworld", "smoke"), Runner(store)
+    groups, unseen = (
+        parse_settings("gridworld", text) for text in ("path-group=1,2,3", "blocked=1,2")
+    )
+    sweep = runner.run(sweep_maxent.request("gridworld", groups, unseen, config))
+    rows = pq.read_table(sweep.directory / "rewards.parquet").to_pylist()
+    penalised = next(row for row in rows if row["penalty"] == "irmv1")
+    for row in (rows[1], penalised, rows[-1]):
+        how = {name: row[name] for name in ("grouping", "penalty", "penalty_weight", "l2")}
+        demos = collect_experts.request(
+            "gridworld", groups, config, row["seed"], config.figure2.episodes
+        )
+        maxent = msgspec.structs.replace(config.maxent, **how)
+        learned = runner.run(
+            train_maxent.request(From(demos), "gridworld", groups, unseen, maxent, row["seed"])
+        )
+        _, tensors = checkpoints.load(learned.directory / "reward.pt", "tabular-reward")
+        assert row["reward"] == pytest.approx(tensors["reward"].tolist(), abs=1e-6)
 
 
 def test_a_warm_up_changes_the_reward_only_through_the_penalty(run, demos):

@@ -16,6 +16,7 @@ from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
 from irlcli.requests.arguments import warn_of_seen
 from irlcli.rl.ppo import PPOTrainer
+from irlcli.rl.rollout import roll_out
 from irlcli.rl.sac import SACTrainer
 from irlcli.stages.base import environment_key
 from irlcli.stages.running import frozen_reward
@@ -174,10 +175,22 @@ def test_a_ceiling_changes_the_policy_and_evaluations_stay_unbounded(runs, irl):
     command = ["transfer", "--reward", "airl", "--ood", "friction"]
     plain = made(runs, irl(*command, *common(runs)))
     low = made(runs, irl(*command, "--set", "transfer.ceiling=0.1", *common(runs), "--name", "low"))
-    policies = [(a.directory / "policy.pt").read_bytes() for a in (plain, low)]
-    assert policies[0] != policies[1]
-    done = irl("evaluate", "--policy", "low", "--reward", "airl", *common(runs))
-    assert done.code == 0, done.err
+    (free, _), (policy, about) = (load_policy_file(a.directory / "policy.pt") for a in (plain, low))
+    ours, theirs = (p.state_dict() for p in (policy, free))
+    assert any(not torch.equal(ours[name], theirs[name]) for name in ours)
+    score = made(runs, irl("evaluate", "--policy", "low", "--reward", "airl", *common(runs)))
+    paid = pq.read_table(score.directory / "episodes.parquet")["learned_return"].to_pylist()
+    modal = score.manifest.record.parameters["evaluation"]["deterministic"]
+    (setting,) = about.settings
+    parsed = parse_setting("half-cheetah", setting)
+    acted = roll_out("half-cheetah", parsed, policy, len(paid), 0, "evaluate", modal)
+    model, origin = load_reward_file(Store(runs).resolve("airl").artefact.directory / "reward.pt")
+    where = environment_key("half-cheetah"), setting, model, origin
+    unbounded, bounded = (
+        [frozen_reward(*where, ceiling).of_episode(episode) for episode in acted]
+        for ceiling in (None, 0.1)
+    )
+    assert paid == pytest.approx(unbounded) and paid != pytest.approx(bounded)
 
 
 def test_a_training_setting_is_named_as_for_evaluations(runs, irl):
