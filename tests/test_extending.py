@@ -13,7 +13,6 @@ from irlcli import learners, penalties, rl
 from irlcli.envs import registry
 from irlcli.experiments.references import demonstrations
 from irlcli.experiments.runner import Runner
-from irlcli.stages.base import From
 from irlcli.store import Store
 
 PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
@@ -188,4 +187,3 @@ def test_a_stage(lab, store_copy):
     import pyarrow.parquet as pq
 
     assert steps == pq.read_table(source.path / "steps.parquet").num_rows
-    assert isinstance(From(count_steps.request(source)).request.parameters, object)

@@ -196,7 +196,6 @@ CRAFTED = {
     "network is a list": description(network=[]),
     "scale is zero": description(scale=0.0),
     "no scale": description(scale=...),
-    "no fixed_horizon": description(airl={}),
     "empty pickle": b"",
     "stack underflow": b"\x80\x02R.",
     "missing memo": b"\x80\x02h\x05.",
@@ -210,9 +209,18 @@ CRAFTED = {
 def test_crafted_reward_files(irl, store_copy, tmp_path, name):
     """Tensor files without tensors or without sense: named, refused, nothing printed at length."""
     path = torch_zip(tmp_path / "crafted.pt", CRAFTED[name])
-    result = irl(*arguments(f"transfer --reward {path} --ood 1.75x", store_copy.path))
+    # Planning reads the description and no tensor, whose absence would be refused as well.
+    line = f"transfer --reward {path} --ood 1.75x --dry-run"
+    result = irl(*arguments(line, store_copy.path))
     assert "crafted.pt" in assert_answered(result, result.code, "")
     assert result.code in (2, 4)
+
+
+def test_a_sound_description_is_planned_with(irl, store_copy, tmp_path):
+    path = torch_zip(tmp_path / "sound.pt", description())
+    line = f"transfer --reward {path} --ood 1.75x"
+    assert irl(*arguments(f"{line} --dry-run", store_copy.path)).code == 0
+    assert_answered(irl(*arguments(line, store_copy.path)), 4, "sound.pt")
 
 
 def test_a_reward_of_an_unknown_environment(irl, store_copy, tmp_path):

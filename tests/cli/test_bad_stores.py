@@ -116,16 +116,6 @@ def test_senseless_parameters_do_not_break_listing(irl, store_copy, publish, par
         assert "\x1b" not in result.out  # nor drive the terminal
 
 
-def test_lineage_of_an_artefact_that_holds_its_own_input(irl, empty_store, publish):
-    """Equal files are one content: ancestry by content can lead back to where it began."""
-    first = publish(empty_store, {"f": b"same"}).artefact
-    sha = first.output("f").sha256
-    second = publish(empty_store, {"f": b"same", "g": b"x"}, inputs={"reward": sha}).artefact
-    result = irl(*arguments(f"lineage {second.id}", empty_store.root))
-    assert result.code == 0, result.err
-    assert second.id in result.out
-
-
 # Stores
 
 
@@ -357,12 +347,6 @@ def test_a_name_that_moves_says_what_it_leaves(irl, store_copy):
     assert f"warning: demos no longer names {store_copy.demos}" in result.err
     again = irl(*arguments("name airl demos", store_copy.path))
     assert again.code == 0 and again.err == ""
-
-
-def test_an_unknown_stage_lists_those_there_are(irl, store_copy):
-    result = irl(*arguments("ls --stage train-ariel", store_copy.path))
-    assert (result.code, result.out) == (0, "")
-    assert "'train-ariel'" in result.err and "train-airl, " in result.err
 
 
 @pytest.mark.parametrize(

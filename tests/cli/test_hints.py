@@ -94,7 +94,8 @@ def test_a_mistyped_name_may_also_be_in_another_store(irl, smoke_store):
 
 def test_a_mistyped_stage_has_a_suggestion(irl, smoke_store):
     done = irl("ls", "--stage", "tranfer", "--store", smoke_store.path)
-    assert done.code == 0 and "did you mean 'transfer'?" in done.err
+    assert (done.code, done.out) == (0, "") and "did you mean 'transfer'?" in done.err
+    assert "'tranfer'" in done.err and "train-airl, " in done.err
 
 
 def test_a_stage_of_an_empty_store(irl, empty_store):

@@ -35,6 +35,17 @@ def imported(irl, store, *words):
     return Store(store.path).resolve(done.out.strip().rpartition("/")[2]).artefact
 
 
+def test_cut_takes_an_episode_without_its_end_and_says_so(irl, store_copy, exported):
+    table = pq.read_table(exported)
+    ended = np.asarray(table["terminated"]) | np.asarray(table["truncated"])
+    without_first_end = np.delete(np.arange(len(table)), np.flatnonzero(ended)[0])
+    pq.write_table(table.take(without_first_end), exported)
+    line = ["import", exported, *LANDER, "--store", store_copy.path, "--quiet"]
+    assert_answered(irl(*line), 2, "neither terminated nor truncated")
+    done = irl(*line, "--cut")
+    assert done.code == 0 and "1 episode" in done.err
+
+
 def test_lineage_names_the_recording_that_was_used(irl, store_copy, exported, tmp_path):
     """Other files may hold the same episodes."""
     used = imported(irl, store_copy, exported, *LANDER)

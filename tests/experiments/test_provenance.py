@@ -91,10 +91,11 @@ def test_every_attempt_is_kept_with_its_seconds_and_its_code(tmp_path, monkeypat
 def test_the_time_of_day_has_no_part_in_durations(tmp_path, monkeypatch):
     """The clock is set back while the stage runs, here at every look."""
     now = time.time()
-    moments = iter(range(10**6))
+    moments, seconds = iter(range(10**6)), iter(range(10**6))
     monkeypatch.setattr(time, "time", lambda: now - 3600.0 * next(moments))
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(seconds)))
     artefact, _ = attempt(tmp_path, counting())
-    assert 0.08 <= artefact.provenance()["seconds"] < 60.0
+    assert 0.0 < artefact.provenance()["seconds"] <= next(seconds)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +116,33 @@ def test_other_libraries_start_over_and_say_so(tmp_path, monkeypatch, name, now,
     assert len(warnings) == 1 and named in warnings[0] and "starting over" in warnings[0]
     # What was thrown away is no part of the result.
     assert len(artefact.provenance()["attempts"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "first"), [(None, "3.3", b"2"), ("3.2", None, b"2"), ("3.2", "3.3", b"0")]
+)
+def test_a_library_that_is_missing_at_one_time_starts_nothing_over(
+    tmp_path, monkeypatch, before, now, first
+):
+    real = provenance.libraries()
+    monkeypatch.setattr(provenance, "libraries", lambda: {**real, "mujoco": before})
+    die(tmp_path, 2)
+    monkeypatch.setattr(provenance, "libraries", lambda: {**real, "mujoco": now})
+    artefact, _ = attempt(tmp_path, counting())
+    assert (artefact.directory / "count").read_bytes() == first
+
+
+def test_a_checkpoint_is_due_ten_seconds_after_the_last(tmp_path, monkeypatch):
+    clock, saved = [0.0], []
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+
+    def run(job):
+        for clock[0] in (9.0, 11.0, 20.0, 21.5):
+            job.checkpoints.offer(lambda: saved.append(clock[0]) or b"x")
+        (job.output / "f").touch()
+
+    Runner(tmp_path).run(Request(Stage("count", 1, run), Parameters(), {}, "count"))
+    assert saved == [11.0, 21.5]
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from irlcli.store import Store
 CHAIN = """
 import sys
 import msgspec
+from irlcli.cli.console import TerminalConsole
 from irlcli.interventions import parse_setting, parse_settings
 from irlcli.experiments.runner import Runner
 from irlcli.configs import load_config
@@ -42,7 +43,7 @@ def request(stage):
 RUN = (
     CHAIN
     + """
-runner = Runner(sys.argv[1], command=["irl", "test"], checkpoint_seconds=0.0)
+runner = Runner(sys.argv[1], TerminalConsole(), command=["irl", "test"], checkpoint_seconds=0.0)
 print(runner.run(request(sys.argv[2])).manifest.id)
 """
 )
@@ -209,9 +210,11 @@ def test_a_damaged_checkpoint_is_reported_and_not_used(tmp_path):
 
 def test_processes_that_ask_for_the_same_artefact_share_the_work(tmp_path):
     processes = [start(tmp_path, "collect-experts") for _ in range(2)]
-    ids = {finish(p) for p in processes}
-    assert len(ids) == 1
+    ended = [process.communicate(timeout=300) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], ended
+    assert len({out for out, _ in ended}) == 1
     store = Store(tmp_path)
-    assert len(store.ids()) == 3  # two experts and the dataset, each made once
+    # Two experts and the dataset, each made once.
+    assert sum(errors.count("RUN ") for _, errors in ended) == len(store.ids()) == 3
     assert not list(tmp_path.glob(".work/*"))
     assert not store.verify(store.ids()).damaged

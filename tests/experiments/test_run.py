@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -136,13 +137,24 @@ def test_what_exists_needs_no_process(uninterrupted, runs):
     _, earlier = uninterrupted
     store = earlier.log.parent / "runs"
     before = earlier.log.read_bytes()
-    runs.tables = earlier.tables
     errors = runs.run(store, *REWARDS)
     assert "6 of 6 steps exist" in errors
     process = runs.start(store, *REWARDS, "--json")
     document = json.loads(process.communicate(timeout=600)[0])
     assert (document["kind"], document["existed"], document["made"]) == ("run", 6, 0)
     assert runs.processes() == [] and earlier.log.read_bytes() == before
+
+
+@pytest.mark.parametrize("more", [[], ["--cluster", "local"]])
+def test_what_exists_without_a_name_gets_its_name(uninterrupted, runs, tmp_path, more):
+    if more:
+        pytest.importorskip("submitit")
+    source, store = uninterrupted[1].log.parent / "runs", tmp_path / "runs"
+    shutil.copytree(source, store, symlinks=True)
+    for name in (store / ".names").iterdir():
+        name.unlink()
+    runs.run(store, *REWARDS, *more)
+    assert runs.processes() == [] and Store(store).names() == Store(source).names()
 
 
 @pytest.mark.parametrize("more", [[], ["--cluster", "local"]])

@@ -44,10 +44,16 @@ def test_what_the_commands_made_are_hits(lab, store_copy, capsys):
     assert sum("train-airl" in line for line in err.splitlines()) == 1
 
 
-def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab):
+def test_what_a_lab_made_are_hits_for_the_recorded_command(irl, lab, tmp_path):
     """The command is what `irl show` prints, and what a damaged artefact shows as its repair."""
+    recording = tmp_path / "demos.parquet"
+    exported = irl("export", "demos", "--to", f"parquet:{recording}", "demos", "--store", lab.store)
+    assert exported.code == 0, exported.err
+    grid = lab.collect_experts("gridworld", "path-group", episodes=[3, 2, 1], seed=2)
     made = [
-        lab.collect_experts("gridworld", "path-group", episodes=[3, 2, 1], seed=2),
+        grid,
+        lab.train_maxent(grid, method="erm"),
+        lab.import_demonstrations(recording, "lunar-lander", "engine-power=1x,1.25x"),
         lab.evaluate(idle=True, **IDLE),
         irlcli.Lab(
             lab.store, profile="smoke", set=["transfer.total_steps=1024", "transfer.ppo.n_epochs=2"]

@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -82,9 +81,13 @@ def test_what_other_machines_left_is_removed_after_a_day(empty_store, leases):
 def test_waiting_ends_when_the_lease_ends(empty_store, leases, monkeypatch):
     monkeypatch.setattr(lease, "_POLL_SECONDS", 0.01)
     path = foreign(leases / f"{KEY}.claim")
-    threading.Timer(0.1, path.unlink).start()
     waited_for = []
-    work(empty_store, wait=True, on_wait=waited_for.append)
+
+    def on_wait(holder):
+        waited_for.append(holder)
+        path.unlink()
+
+    work(empty_store, wait=True, on_wait=on_wait)
     assert waited_for == ["process 1 on another-node"]
 
 

@@ -12,10 +12,12 @@ from every_step import counter, in_child, intercept, kill_self
 from places import at, files_of, memory, other, pull, push
 
 from irlcli.cli.options import sources_of_environment
+from irlcli.errors import Busy
 from irlcli.experiments.status import Lookup
 from irlcli.stages.base import Request, Stage
 from irlcli.store import Store
 from irlcli.store.remote import Remote
+from irlcli.store.share import share
 from irlcli.store.sources import open_place
 
 
@@ -216,6 +218,17 @@ def test_a_path_of_the_default_store_names_the_same_behind_a_url(store, chain, u
     push(store, url, chain["airl"])
     for ref in ("irm-0", chain["airl"].id, f"runs/{chain['airl'].id}"):
         assert open_place(url, pytest.fail).resolve(ref).artefact.id == chain["airl"].id
+
+
+def test_gc_at_the_destination_waits_for_a_push(store, chain, tmp_path):
+    there, collected = other(tmp_path), []
+
+    def advance(number):
+        with pytest.raises(Busy):
+            collected.append(Store(there.root).collect(-1.0))
+
+    share(store, there, [chain["airl"]], pytest.fail, lambda count, total: advance)
+    assert len(there.ids()) == 3 and not collected
 
 
 def test_two_pushes_at_once(store, chain, url, monkeypatch):

@@ -1,0 +1,65 @@
+"""What a queue is told: which jobs, each after the jobs of what it needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from test_run import TABLES, Unseen
+
+from irlcli.experiments.cluster.submission import JobCommand, Submission
+from irlcli.experiments.runner import Silent
+from irlcli.requests.session import StageSession
+from irlcli.requests.tables import TableChoice, open_plan
+
+
+class Told:
+    """A queue that notes what each job was told to wait for, and starts none."""
+
+    name, place, starts_what_waits, lag = "told", "a queue", True, 0.0
+
+    def __init__(self):
+        self.jobs = {}
+
+    def submit(self, jobs, logs, after, matching):
+        number = str(len(self.jobs))
+        ids = [f"{number}_{i}" for i in range(len(jobs))] if len(jobs) > 1 else [number]
+        for i, (job, own) in enumerate(zip(jobs, ids, strict=True)):
+            waits = [*after, *([f"{matching}_{i}"] if matching else [])]
+            self.jobs[own] = job.name, {self.jobs[other][0] for other in waits}
+        return ids
+
+    def states(self):
+        return dict.fromkeys(self.jobs, "PENDING (Dependency)")
+
+    def cancel(self, ids):
+        pytest.fail("a job was cancelled")
+
+    def probe(self, store, console):
+        pass
+
+
+def closure(needs):
+    """All that each step needs, directly or not."""
+
+    def above(name):
+        return set(needs[name]).union(*map(above, needs[name]))
+
+    return {name: above(name) for name in needs}
+
+
+def test_each_job_waits_for_what_it_needs_and_is_submitted_once(tmp_path):
+    tables = tmp_path / "tables.toml"
+    tables.write_text(TABLES.replace("[0]", "[0, 1, 2]"))
+    line = {"profile": "smoke", "file": None, "overrides": [], "sources": [], "command": ["irl"]}
+    session = StageSession(tmp_path / "runs", Silent(), **line)
+    session.store.create()
+    plan = open_plan(session, TableChoice("tiny", tag="smoke", file=tables))
+    queue, command = Told(), JobCommand(lambda name: ["true"], Path.cwd(), 0, 1)
+
+    def submit():
+        return Submission(plan, session.runner(), queue, command, Unseen()).submit()
+
+    assert submit() == len(plan.tasks) == len(queue.jobs)
+    assert closure(dict(queue.jobs.values())) == closure(plan.needs)
+    assert submit() == 0
