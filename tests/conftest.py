@@ -123,14 +123,24 @@ def _build_chain(store: Path) -> dict[str, str]:
     return {**ids, "expert": expert.id}
 
 
+def copy_store(source: Path, to: Path) -> Path:
+    """A copy of a store that other workers may be reading."""
+    # The mark of a reader comes and goes.
+    passing = shutil.ignore_patterns(".reader.*")
+    return shutil.copytree(source, to, symlinks=True, ignore=passing)
+
+
 @pytest.fixture
 def store_copy(smoke_store: SmokeStore, tmp_path: Path) -> SmokeStore:
     """A copy of the smoke store that a test may change."""
-    path = tmp_path / "runs"
-    # Another worker may be reading the store; its mark there comes and goes.
-    passing = shutil.ignore_patterns(".reader.*")
-    shutil.copytree(smoke_store.path, path, symlinks=True, ignore=passing)
+    path = copy_store(smoke_store.path, tmp_path / "runs")
     return SmokeStore(**{**asdict(smoke_store), "path": path})
+
+
+@pytest.fixture(scope="session")
+def copied() -> Callable[[Path, Path], Path]:
+    """:func:`copy_store`, for fixtures that outlive a test."""
+    return copy_store
 
 
 @pytest.fixture(scope="session")

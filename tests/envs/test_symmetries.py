@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from bullet_robots import body, pybullet
 
 from irlcli.envs.ant.env import Ant
 from irlcli.envs.ant.symmetries import symmetries
 from irlcli.envs.declared_symmetries import check_group
 from irlcli.symmetries import Symmetries
-from tests.envs.bullet_robots import body, pybullet
 
 SQUARE = [{"friction": (2.0, 0.6, 0.6)}, {"mass": 2.0}, {}]
 LONG_LEGS = {"leg_length": 2.0}

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from chains import CHAIN, GRIDWORLD, SMOKE, assert_refused
@@ -125,9 +126,11 @@ def test_streams_that_nobody_reads(smoke_store, text, codes):
         assert done.stderr == ""
 
 
-def test_paths_are_printed_as_their_bytes_whatever_the_streams_can_encode(smoke_store, tmp_path):
+def test_paths_are_printed_as_their_bytes_whatever_the_streams_can_encode(
+    smoke_store, copied, tmp_path
+):
     store = os.fsencode(tmp_path) + b"/store \xc3\xa9"
-    shutil.copytree(os.fsencode(smoke_store.path), store, symlinks=True)
+    copied(smoke_store.path, Path(os.fsdecode(store)))
     line = [*CHAIN[3], *SMOKE, "--quiet", "--store", store]
     for name in ("UTF-8", "ascii"):
         done = subprocess.run(

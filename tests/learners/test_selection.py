@@ -136,12 +136,9 @@ def test_one_episode_in_five_is_held_out_and_at_least_one(demos):
 
 
 @pytest.fixture(scope="module")
-def chosen(smoke_store, tmp_path_factory, run_irl):
+def chosen(smoke_store, copied, tmp_path_factory, run_irl):
     """A reward whose lambda was chosen, and its store."""
-    import shutil
-
-    path = tmp_path_factory.mktemp("choice") / "runs"
-    shutil.copytree(smoke_store.path, path)
+    path = copied(smoke_store.path, tmp_path_factory.mktemp("choice") / "runs")
     arguments = ["train-airl", "--demos", "demos", "--method", "irm", "--profile", "smoke"]
     arguments += ["--store", str(path), "--choose-penalty", "1,0.1", "--name", "chosen"]
     plan = run_irl([*arguments, "--dry-run"]).out

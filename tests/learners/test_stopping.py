@@ -60,12 +60,9 @@ def test_a_run_killed_after_its_last_round_trains_no_further():
 
 
 @pytest.fixture(scope="module")
-def line(smoke_store, tmp_path_factory):
+def line(smoke_store, copied, tmp_path_factory):
     """A training whose cross-entropy falls from above chance, so that two rounds are a plateau."""
-    import shutil
-
-    path = tmp_path_factory.mktemp("plateau") / "runs"
-    shutil.copytree(smoke_store.path, path)
+    path = copied(smoke_store.path, tmp_path_factory.mktemp("plateau") / "runs")
     return ["train-airl", "--demos", "demos", "--profile", "smoke", "--store", str(path), "--json"]
 
 

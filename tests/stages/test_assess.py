@@ -28,10 +28,9 @@ LADDER = [f"clone, noise {noise}" for noise in (0.0, 0.1, 0.25, 0.5, 0.75)]
 
 
 @pytest.fixture(scope="module")
-def assessed(smoke_store, tmp_path_factory, run_irl):
+def assessed(smoke_store, copied, tmp_path_factory, run_irl):
     """A copy of the smoke store with an assessment in the settings trained in, and the document."""
-    path = tmp_path_factory.mktemp("assess") / "runs"
-    shutil.copytree(smoke_store.path, path, symlinks=True)
+    path = copied(smoke_store.path, tmp_path_factory.mktemp("assess") / "runs")
     line = ["assess", "airl", "--store", str(path), *SMOKE, "--json", "--name", "assessed"]
     done = run_irl(line)
     assert done.code == 0, done.err
