@@ -387,13 +387,13 @@ def a_second_learner_algorithm_and_penalty(monkeypatch):
 
 @pytest.mark.parametrize("stage", sorted(REQUESTS.keys() - {"figure2", "control"}))
 def test_a_stage_reads_the_sections_that_its_key_depends_on(stage):
-    """And a few more: the PPO of challengers, the default of demonstrations, the noise of a bank."""
+    """And a few more: the PPO of challengers, the default of demonstrations, the noise of a bank, bars."""
     request, fields = REQUESTS[stage]
     sections = {field.partition(".")[0] for field in fields}
     read = {
         part.partition(".")[0] for made in behind(request(in_use())) for part in made.stage.reads
     }
-    assert sections <= read <= sections | {"transfer", "demonstrations", "assessment"}
+    assert sections <= read <= sections | {"transfer", "demonstrations", "assessment", "expert"}
 
 
 def test_every_stage_is_covered():

@@ -107,7 +107,7 @@ def test_a_bank_has_one_expert_in_each_setting(made):
     reward, origin = tensor_file(store, f"{ROW}.irm.0", "reward")
     texts = [f"cue-strength={value}" for value in ("0.95", "0.8", "0.5")]
     settings = [parse_setting("lunar-lander", text) for text in texts]
-    policies = Finder(store, Lookup(store), config).policies(reward, origin, settings, None, ())
+    policies = Finder(store, Lookup(store), config).policies(reward, origin, settings, None, (), 0)
     entries = bank("lunar-lander", settings, config, policies)
     experts = [(e.kind, e.setting) for e in entries if e.kind in ("expert", "reused")]
     assert experts == [("expert", text) for text in texts]
