@@ -122,11 +122,13 @@ def test_a_process_that_cannot_exist_is_dead(empty_store, leases):
     work(empty_store)
 
 
-def test_a_named_pipe_is_no_lock(empty_store):
+def test_a_named_pipe_in_place_of_a_lock_stops_no_command(empty_store):
     path = empty_store.root / ".locks" / "gc"
     path.unlink(missing_ok=True)
     os.mkfifo(path)
-    work(empty_store)
+    line = [sys.executable, "-P", "-m", "irlcli", "ls", "--store", str(empty_store.root)]
+    # Whoever opened the pipe would wait for its other end for ever.
+    assert subprocess.run(line, capture_output=True, timeout=120).returncode == 0
 
 
 def test_whoever_lost_a_lease_leaves_the_new_one_alone(empty_store, leases):
