@@ -36,6 +36,7 @@ def collect_experts(
             ``expert``.
         NotFound: no such environment or expert.
     """
+    env = resolve(env).name
     if intervention is None and not setting:
         raise UsageError(
             "neither --intervention nor --setting names a setting",
@@ -43,7 +44,6 @@ def collect_experts(
         )
     if trust and not expert:
         raise UsageError("--trust needs --expert, whose files it is about", "omit --trust")
-    env = resolve(env).name
     config = session.config(env)
     settings = arguments.where(None, intervention, setting).settings(env, config)
     listed = config.interventions.get(intervention or "")

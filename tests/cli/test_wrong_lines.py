@@ -18,6 +18,7 @@ WRONG = [
     ("ls surplus", 2, "surplus"),
     ("show", 2, "ref"),
     ("show airl moved", 2, "unexpected argument: moved"),
+    ("collect-experts --env lunar-landr", 2, "'lunar-landr'"),
     ("show .", 3, "'.' is a directory, not an artefact"),
     ("evaluate --policy moved --episodes 1.5", 2, "'1.5' is not a whole number"),
     (
@@ -210,7 +211,8 @@ WRONG = [
     # Malformed values and surplus words
     ("--versoin", 2, "--versoin"),
     ("ls --json=yes", 2, "--json"),
-    ("collect-experts --env ''", 2, "--intervention"),
+    ("collect-experts --env ''", 2, "unknown environment ''"),
+    ("collect-experts --env ant", 2, "--intervention"),
     ("collect-experts --env gridworld --intervention path-group=4", 2, "'4'"),
     ("collect-experts --env gridworld --intervention path-group=1.5", 2, "'1.5'"),
     ("collect-experts --env gridworld --intervention blocked=1x", 2, "'1x'"),
