@@ -39,7 +39,13 @@ def test_a_shortage_of_memory_does_not_discard_a_checkpoint(monkeypatch):
     assert not reasons
 
 
-TRAINING = {"trainer": {}, "learner": {}, "selector": {}, "rounds_done": 0}
+def unmade(store: Store, ref: str) -> str:
+    """The key of ``ref``, whose artefact is removed from ``store``."""
+    made = store.resolve(ref).artefact
+    key = made.manifest.record.key
+    (store.root / ".keys" / key).unlink()
+    remove(made.directory)
+    return key
 
 
 def save_checkpoint(store: Store, key: str, stage: Stage, state: dict, attempts=()) -> None:
@@ -57,10 +63,7 @@ def save_checkpoint(store: Store, key: str, stage: Stage, state: dict, attempts=
 
 def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
     store = Store(store_copy.path)
-    key = store.resolve(store_copy.transfer).artefact.manifest.record.key
-    (store.root / ".keys" / key).unlink()
-    # So that the artefact is written anew, with the provenance of this run.
-    remove(store.root / store_copy.transfer)
+    key = unmade(store, store_copy.transfer)
     attempts = (provenance.Clock().attempt(),)
     save_checkpoint(store, key, transfer.STAGE, {"other": torch.ones(1)}, attempts)
     done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
@@ -68,26 +71,42 @@ def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
     assert store.resolve(store_copy.transfer).artefact.provenance()["resumed"] == 0
 
 
+def changed(state: dict, path: str, value) -> dict:
+    """A copy of ``state`` with ``value`` at ``path``, e.g. ``training.rounds_done``."""
+    if not path:
+        return value
+    first, _, rest = path.partition(".")
+    return {**state, first: changed(state[first], rest, value)}
+
+
+def test_the_state_that_the_planted_ones_differ_from_is_resumed(irl, store_copy, transfer_state):
+    store = Store(store_copy.path)
+    key = unmade(store, store_copy.transfer)
+    save_checkpoint(store, key, transfer.STAGE, transfer_state, (provenance.Clock().attempt(),))
+    done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
+    assert done.code == 0, done.err
+    assert store.resolve(store_copy.transfer).artefact.provenance()["resumed"] == 1
+
+
 @pytest.mark.parametrize(
-    "changes",
+    ("path", "value"),
     [
-        {"training": {}},
-        {"training": []},
-        {"training": {**TRAINING, "trainer": []}},
-        {"training": {**TRAINING, "trainer": {"policy": {}, "optimizer": {}, "steps": 0}}},
-        {"training": {**TRAINING, "rounds_done": "x"}},
-        {"rows": torch.zeros(3, dtype=torch.uint8)},
-        {"rows": 7},
+        ("training", {}),
+        ("training", []),
+        ("training.trainer", []),
+        ("training.trainer.policy", {}),
+        ("training.trainer.optimizer", {"state": {}, "param_groups": []}),
+        ("training.trainer.steps", "x"),
+        ("training.rounds_done", "x"),
+        ("rows", torch.zeros(3, dtype=torch.uint8)),
+        ("rows", 7),
     ],
 )
-def test_a_planted_checkpoint_is_named(irl, store_copy, changes):
+def test_a_planted_checkpoint_is_named(irl, store_copy, transfer_state, path, value):
     """Valid tensors, header and checksum around a state that no stage wrote."""
     store = Store(store_copy.path)
-    key = store.resolve(store_copy.transfer).artefact.manifest.record.key
-    (store.root / ".keys" / key).unlink()
-    rows = torch.frombuffer(bytearray(b"[]"), dtype=torch.uint8)
-    state = {"training": TRAINING, "rows": rows, **changes}
-    save_checkpoint(store, key, transfer.STAGE, state)
+    key = unmade(store, store_copy.transfer)
+    save_checkpoint(store, key, transfer.STAGE, changed(transfer_state, path, value))
     done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
     assert_refused((done.code, done.out, done.err), 4, key)
     shutil.rmtree(store.root / ".work" / key)
@@ -95,26 +114,42 @@ def test_a_planted_checkpoint_is_named(irl, store_copy, changes):
     assert Path(again.out.strip()).name == store_copy.transfer
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"networks": {}},
-        {"optimizer": {"state": {}, "param_groups": []}},
-        {"records": []},
-        {"records": "x"},
-        {"iterations": "many"},
-    ],
-)
-def test_a_planted_gridworld_checkpoint_is_named(irl, maze_store, tmp_path, changes):
+@pytest.fixture
+def maze_copy(maze_store, tmp_path) -> Store:
+    """A copy of the store with a gridworld's chain."""
     path = tmp_path / "runs"
     shutil.copytree(maze_store, path, symlinks=True)
-    store = Store(path)
-    found = store.resolve(store.names()["maxent"]).artefact.manifest.record
-    (store.root / ".keys" / found.key).unlink()
-    state = {"iterations": 1, "networks": {}, "optimizer": {}, "records": [], **changes}
-    save_checkpoint(store, found.key, train_maxent.STAGE, state)
-    done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", path)
-    assert_refused((done.code, done.out, done.err), 4, found.key)
+    return Store(path)
+
+
+def test_the_gridworld_state_that_the_planted_ones_differ_from_is_resumed(
+    irl, maze_copy, maxent_state
+):
+    key = unmade(maze_copy, "maxent")
+    attempts = (provenance.Clock().attempt(),)
+    save_checkpoint(maze_copy, key, train_maxent.STAGE, maxent_state, attempts)
+    done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", maze_copy.root)
+    assert done.code == 0, done.err
+    assert maze_copy.resolve("maxent").artefact.provenance()["resumed"] == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("networks", {}),
+        ("networks.weight", torch.zeros(2)),
+        ("optimizer", {"state": {}, "param_groups": []}),
+        ("records", [1]),
+        ("records", "x"),
+        ("iterations", "many"),
+    ],
+)
+def test_a_planted_gridworld_checkpoint_is_named(irl, maze_copy, maxent_state, path, value):
+    key = unmade(maze_copy, "maxent")
+    state = changed(maxent_state, path, value)
+    save_checkpoint(maze_copy, key, train_maxent.STAGE, state)
+    done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", maze_copy.root)
+    assert_refused((done.code, done.out, done.err), 4, key)
 
 
 def outside_checkpoint(store, key, outside):
