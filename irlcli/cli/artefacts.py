@@ -11,6 +11,7 @@ from irlcli.cli.options import Ref, store_command
 from irlcli.cli.session import Session
 from irlcli.errors import suggest
 from irlcli.store import Artefact, Index, Store
+from irlcli.store.artefact import stored_inputs
 
 if TYPE_CHECKING:
     from irlcli.store.remote import Remote
@@ -46,7 +47,7 @@ def ls(
             "names": names.get(artefact.id, []),
             "about": labels.describe(record) + labels.origin(record, makers),
             "budget": labels.budget(record.parameters),
-            "bytes": sum(output.size for output in artefact.manifest.outputs),
+            "bytes": artefact.manifest.size,
         }
         for artefact in stored
         if stage in (None, (record := artefact.manifest.record).stage)
@@ -105,13 +106,13 @@ def _tree(index: Index, artefact: Artefact, descendants: tuple[str, ...]) -> dic
     record = artefact.manifest.record
     descendants = (*descendants, artefact.id)
     inputs = []
-    recorded = artefact.provenance().get("inputs") or {}
+    provenance = artefact.provenance()
     for role, sources in index.parents(artefact).items():
         # Inputs are known by content. Several artefacts may hold it: the recorded one comes first, and
         # a descendant is no ancestor.
-        made_from = str(recorded.get(role, "")).partition("/")[0]
+        recorded = stored_inputs(provenance, [role])
         others = [source for source in sources if source.id not in descendants]
-        source = min(others, key=lambda s: s.id != made_from, default=None)
+        source = min(others, key=lambda s: s.id not in recorded, default=None)
         origin = _tree(index, source, descendants) if source is not None else None
         inputs.append({"role": role, "sha256": record.inputs[role], "from": origin})
     return {

@@ -32,16 +32,6 @@ def groupings() -> list[str]:
     return list(get_args(Grouping))
 
 
-def airl_penalties() -> list[str]:
-    """Penalties of adversarial learners."""
-    return penalties("airl")
-
-
-def maxent_penalties() -> list[str]:
-    """Penalties of MaxEnt IRL."""
-    return penalties("maxent")
-
-
 def penalties(learner: str) -> list[str]:
     """Penalties of ``learner``: ``airl`` or ``maxent``."""
     from irlcli.penalties import PENALTIES

@@ -19,16 +19,12 @@ from irlcli.interventions import listed_settings
 _ACTIONS = ("list", "show", "check")
 
 
-def _actions() -> list[str]:
-    return list(_ACTIONS)
-
-
 @store_command
 def envs(
     session: Session,
     action: Annotated[
         str,
-        typer.Argument(metavar="list|show|check", autocompletion=_actions),
+        typer.Argument(metavar="list|show|check", autocompletion=lambda: list(_ACTIONS)),
     ],
     env: Annotated[
         str | None,

@@ -134,7 +134,7 @@ def gc(
         submissions = ended_submissions(session, grace)
         with session.reading():
             artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
-    size = sum(output.size for artefact in artefacts for output in artefact.manifest.outputs)
+    size = sum(artefact.manifest.size for artefact in artefacts)
     if session.as_json:
         value = {"deleted": delete, "artefacts": [a.id for a in artefacts], "bytes": size}
         value |= {"work": [path.name for path in work]}

@@ -98,12 +98,13 @@ def _usage(error: Any) -> UsageError:
     message = re.sub("a valid float( range)?$", "a number", message)
     extra = re.match(r"^Got unexpected extra argument.*? \((.*)\)$", message)
     hint = f"`{path} --help` lists {'the commands' if path == 'irl' else 'what it accepts'}"
+    given = {word.partition("=")[0] for word in sys.argv}
     if extra:
         message = f"Unexpected argument: {extra[1]}"
-        if {"--rows", "--seeds", "--methods"} & set(sys.argv):
+        if {"--rows", "--seeds", "--methods"} & given:
             hint = f"write a list with commas and without spaces, as in --seeds 0,1; {hint}"
     missing = re.match("^Missing argument '(TABLE|REPORT)'", message)
-    if missing and "--experiments" not in sys.argv:
+    if missing and "--experiments" not in given:
         from irlcli.cli import complete
 
         known = complete.tables() if missing[1] == "TABLE" else complete.reports()
@@ -114,7 +115,7 @@ def _usage(error: Any) -> UsageError:
 def _fail(error: IrlError) -> None:
     # The program ends here, so a further Ctrl-C must not interrupt the error message.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if _debugging():
+    if "--debug" in sys.argv:
         import traceback
 
         traceback.print_exc()
@@ -124,7 +125,3 @@ def _fail(error: IrlError) -> None:
     finally:
         # The exit code must be right even if nobody reads the message.
         sys.exit(error.exit_code)
-
-
-def _debugging() -> bool:
-    return "--debug" in sys.argv

@@ -33,10 +33,6 @@ from irlcli.store import Artefact
 _FORMS = ("text", "markdown", "latex")
 
 
-def _forms() -> list[str]:
-    return list(_FORMS)
-
-
 @stage_command
 def report(
     session: StageSession,
@@ -56,7 +52,9 @@ def report(
     form: Annotated[
         str | None,
         typer.Option(
-            "--format", help="Format of table2: text, markdown or latex.", autocompletion=_forms
+            "--format",
+            help="Format of table2: text, markdown or latex.",
+            autocompletion=lambda: list(_FORMS),
         ),
     ] = None,
     file: TableFile = None,

@@ -40,7 +40,7 @@ def train_airl(
     grouping: _Grouping = None,
     penalty: Annotated[
         str | None,
-        typer.Option(help=_listed("airl"), autocompletion=complete.airl_penalties),
+        typer.Option(help=_listed("airl"), autocompletion=lambda: complete.penalties("airl")),
     ] = None,
     penalty_weight: _PenaltyWeight = None,
     choose_penalty: Annotated[
@@ -98,7 +98,7 @@ def train_maxent(
     grouping: _Grouping = None,
     penalty: Annotated[
         str | None,
-        typer.Option(help=_listed("maxent"), autocompletion=complete.maxent_penalties),
+        typer.Option(help=_listed("maxent"), autocompletion=lambda: complete.penalties("maxent")),
     ] = None,
     penalty_weight: _PenaltyWeight = None,
     l2: Annotated[float | None, typer.Option(help="Weight decay.")] = None,

@@ -17,9 +17,13 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
     with ``reward.``.
     """
     found: dict[str, Any] = {}
-    pending = [(artefact, "")]
+    pending, seen = [(artefact, "")], set[tuple[str, str]]()
     while pending:
         at, prefix = pending.pop()
+        # In a crafted store an artefact may be made from itself.
+        if (at.id, prefix) in seen:
+            continue
+        seen.add((at.id, prefix))
         record = at.manifest.record
         for name, value in flat(record.parameters):
             chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs

@@ -1,6 +1,6 @@
 """What a report prints of its artefacts' provenance, and which similar runs it leaves out."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from irlcli import labels
@@ -8,6 +8,7 @@ from irlcli.experiments.circumstances import flat
 from irlcli.methods import method_name
 from irlcli.report.parameters import Code, Others, Run
 from irlcli.store import Artefact, KeyRecord, digest
+from irlcli.store.artefact import stored_inputs
 
 _Subject = tuple[Any, ...]
 # With other inputs, an artefact of these stages is about something else.
@@ -35,18 +36,13 @@ def runs(
             libraries=name,
             seconds=origin.get("seconds"),
             resumed=origin.get("resumed"),
-            inputs=tuple(sorted(set(_ids(origin.get("inputs") or {})))),
+            inputs=tuple(sorted(set(stored_inputs(origin, record.inputs)))),
         )
     return found, libraries
 
 
 def _code(state: Mapping[str, Any]) -> Code:
     return Code(commit=state.get("commit"), dirty=state.get("dirty"))
-
-
-def _ids(inputs: Mapping[str, str]) -> Iterator[str]:
-    for place in inputs.values():
-        yield place.partition("/")[0]
 
 
 def left_out(

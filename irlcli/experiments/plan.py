@@ -1,7 +1,7 @@
 """A table as a list of named steps, and what a store holds of each."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 from irlcli.configs import Config
@@ -52,10 +52,10 @@ class Plan:
         self.selection = selection
         self.lookup = lookup
         self._load = load
-        self._config_of = _cached(lambda env, flags: load(env, flags, ()))
+        self._config_of = _loaded(load)
         self._under = {v: _cached(config_under(v, load)) for v in table.variants}
         self._weighted = {
-            method: _cached(partial(_with_weight, load, weight))
+            method: _loaded(load, f"airl.penalty_weight={weight!r}")
             for method, weight in table.penalty_weights.items()
         }
         self.figure: Request | None = None
@@ -190,7 +190,5 @@ def _cached(config_of: ConfigOf) -> ConfigOf:
     return cached
 
 
-def _with_weight(
-    load: Overridable, weight: float, env: str, flags: Mapping[str, Any] | None
-) -> Config:
-    return load(env, flags, [f"airl.penalty_weight={weight!r}"])
+def _loaded(load: Overridable, *overrides: str) -> ConfigOf:
+    return _cached(lambda env, flags: load(env, flags, overrides))

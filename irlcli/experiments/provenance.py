@@ -74,11 +74,11 @@ def decode(data: bytes, stage: str, stage_version: int) -> tuple[Header, bytes]:
     end = 4 + int.from_bytes(data[:4], "big")
     try:
         schema = msgspec.json.decode(data[4:end], type=_Schema).schema
-        header = msgspec.json.decode(data[4:end], type=Header) if schema == SCHEMA else None
+        if schema != SCHEMA:
+            raise ValueError(f"it has schema {schema}, the one known here is {SCHEMA}")
+        header = msgspec.json.decode(data[4:end], type=Header)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise ValueError("its header is not readable") from None
-    if header is None:
-        raise ValueError(f"it has schema {schema}, the one known here is {SCHEMA}")
     if (header.stage, header.stage_version) != (stage, stage_version):
         raise ValueError(
             f"{header.stage[:40]} {header.stage_version} wrote it, this is {stage} {stage_version}"
@@ -109,9 +109,7 @@ def other_versions(origin: Mapping[str, Any]) -> list[str]:
     The version of irlcli is left out: a change of its code that alters results raises the stage's
     version, and with it the key.
     """
-    recorded = origin.get("libraries")
-    if not isinstance(recorded, dict):
-        recorded = {}
+    recorded = origin.get("libraries") or {}
     return differing({**recorded, "irlcli": libraries()["irlcli"]})
 
 

@@ -5,7 +5,6 @@ Nothing is computed here.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import msgspec
 
@@ -16,12 +15,10 @@ from irlcli.experiments.inputs import source_in
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import made_by
 from irlcli.interventions import listed_settings, without_cue
-from irlcli.report.parameters import ASSESS, CUE, Cell, Row
+from irlcli.report.parameters import ASSESS, CUE, Cell, Row, Run
 from irlcli.stages import report, report_experts
 from irlcli.stages.base import Request, Source
 from irlcli.store import Artefact
-
-_CONFIGS = ("expert", "demonstrations", "airl", "transfer", "evaluation")
 
 
 def request(plan: Plan, command: str) -> Request:
@@ -69,7 +66,7 @@ def _experts(
     command: str,
     cells: Sequence[Cell],
     sources: Mapping[str, Source],
-    runs: Mapping[str, Any],
+    runs: dict[str, Run],
 ) -> Request:
     if not any(cell.run for cell in cells if cell.agent == "expert"):
         raise NotFound(
@@ -88,7 +85,7 @@ def _experts(
         },
         bars={name: expert.bar for name, expert in experts.items() if expert.bar is not None},
         cells=tuple(cells),
-        runs=dict(runs),
+        runs=runs,
     )
     return report_experts.request(parameters, sources)
 
@@ -150,10 +147,12 @@ def _rows(plan: Plan) -> list[Row]:
             listed_settings(row.env, row.knob, values) for values in (listed.id, listed.ood)
         )
         demos = plan.tasks[f"{plan.selection.tag}.{row}.demos"].request
-        tree = msgspec.to_builtins(config) | {
-            "expert": msgspec.to_builtins(config.expert_of(without_cue(row.env, unseen[0]))),
-            "airl": msgspec.to_builtins(config.airl_of(trained)),
-            "transfer": msgspec.to_builtins(config.transfer_of(unseen[0])),
+        configs = {
+            "expert": config.expert_of(without_cue(row.env, unseen[0])),
+            "demonstrations": config.demonstrations,
+            "airl": config.airl_of(trained),
+            "transfer": config.transfer_of(unseen[0]),
+            "evaluation": config.evaluation,
         }
         rows.append(
             Row(
@@ -162,7 +161,7 @@ def _rows(plan: Plan) -> list[Row]:
                 trained=tuple(map(str, trained)),
                 unseen=str(unseen[0]),
                 demonstrations=demos.parameters.episodes,
-                config={stage: tree[stage] for stage in _CONFIGS},
+                config=msgspec.to_builtins(configs),
                 chosen=_chosen(plan, str(row)),
             )
         )

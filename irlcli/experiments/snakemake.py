@@ -35,20 +35,18 @@ def snakefile(
         made_by: the command line to mention in the first line.
     """
     rules: dict[str, str] = {}
-    used: set[str] = set()
     for name in needs:
         rule = re.sub(r"\W", "_", name)
         # Two names that differ only in signs.
-        while rule in used:
+        while rule in rules:
             rule += "_"
-        used.add(rule)
-        rules[name] = rule
+        rules[rule] = name
     everything = ",\n".join(f"        {_done(name)}" for name in needs)
     text = _HEAD.format(made_by=made_by.replace("\n", " "), everything=everything)
-    for name, sources in needs.items():
-        inputs = ", ".join(_done(source) for source in sources)
+    for rule, name in rules.items():
+        inputs = ", ".join(_done(source) for source in needs[name])
         text += _RULE.format(
-            rule=rules[name],
+            rule=rule,
             inputs=f"    input: {inputs}\n" if inputs else "",
             output=_done(name),
             # Snakemake replaces what stands in braces.

@@ -216,20 +216,22 @@ def _lineage(p: Parameters) -> str:
             seed += f", retraining {cell.retraining}" if cell.retraining else ""
             place = f", {cell.place}" if cell.place else ""
             heading = f"{cell.row}, {title(cell.agent)}, {cell.measure}{place}{seed}"
-            tree = escape("\n".join(_tree(p, cell.run, "")))
+            tree = escape("\n".join(_tree(p, cell.run)))
             parts.append(
                 f"<details><summary>{escape(heading)}</summary><pre>{tree}</pre></details>"
             )
     return "".join(parts)
 
 
-def _tree(p: Parameters, id16: str, indent: str) -> list[str]:
-    if id16 not in p.runs:
+def _tree(p: Parameters, id16: str, descendants: tuple[str, ...] = ()) -> list[str]:
+    indent = "  " * len(descendants)
+    # In a crafted store a run may be made from itself.
+    if id16 not in p.runs or id16 in descendants:
         return [f"{indent}{id16}  not a run of this report"]
     run = p.runs[id16]
     took = "" if run.seconds is None else f"  {duration(run.seconds)}"
     line = f"{indent}{id16}  {run.stage}  {run.about}{took}  at {', '.join(commits([run]))}"
-    return [line, *(x for i in run.inputs for x in _tree(p, i, indent + "  "))]
+    return [line, *(x for i in run.inputs for x in _tree(p, i, (*descendants, id16)))]
 
 
 def _configs(p: Parameters) -> str:

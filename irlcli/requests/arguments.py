@@ -54,7 +54,9 @@ class Where(NamedTuple):
         """
         settings = [parse_setting(env, text) for text in self.several]
         if self.text is not None:
-            settings = [*named_settings(env, config, self.text, self.kind, origin), *settings]
+            option = "--ood" if self.kind == "ood" else "--intervention"
+            named = named_settings(env, config, self.text, self.kind, option, origin)
+            settings = [*named, *settings]
         if origin is not None:
             check_observed(env, origin.settings, settings)
         check_distinct("the command", settings)
@@ -77,9 +79,10 @@ def named_settings(
     config: "Config",
     text: str,
     kind: Literal["id", "ood"],
+    option: str,
     origin: "Reward | Policy | None" = None,
 ) -> Sequence[Setting]:
-    """The settings that ``text`` names.
+    """The settings that ``text``, the value of ``option``, names.
 
     ``knob=3x,4x``. A knob alone stands for its values in the settings file, those of ``kind``.
     ``3x,4x`` alone are values of the knob that ``origin`` was trained with.
@@ -98,7 +101,6 @@ def named_settings(
             )
         return listed_settings(env, text, values)
     if origin is None and not text.strip():
-        option = "--ood" if kind == "ood" else "--intervention"
         raise UsageError(f"{option} is empty", f"write {option} KNOB=VALUE,VALUE")
     if origin is None and not text[:1].isalpha():
         raise UsageError(

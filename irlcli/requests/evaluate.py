@@ -147,7 +147,7 @@ def _of_agent(
     if trained_in is None:
         experts = [(setting, [setting]) for setting in settings]
     else:
-        trained = arguments.named_settings(env, config, trained_in, "id")
+        trained = arguments.named_settings(env, config, trained_in, "id", "--trained-in")
         for setting in trained:
             check_observed(env, [str(setting)], settings)
         # Settings that differ in their cue only have one expert.

@@ -264,8 +264,7 @@ class StageSession(Session):
 
 
 def _is_smoke(provenance: Mapping[str, Any]) -> bool:
-    command = provenance.get("command")
-    command = command if isinstance(command, list) else []
+    command = provenance.get("command") or []
     return f"--profile={_SMOKE}" in command or ["--profile", _SMOKE] in map(list, pairwise(command))
 
 

@@ -112,10 +112,8 @@ def entries(directory: Path | str) -> Iterator[str]:
 
 def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[str]:
     """The ids that the inputs ``roles`` were read from; files outside the store are left out."""
-    places = provenance.get("inputs")
-    if not isinstance(places, dict):
-        return []
-    texts = [str(places.get(role, "")).partition("/") for role in roles]
+    places = provenance.get("inputs") or {}
+    texts = [places.get(role, "").partition("/") for role in roles]
     return [id16 for id16, slash, _ in texts if slash and is_id(id16)]
 
 

@@ -53,6 +53,11 @@ def is_hexadecimal(text: str) -> bool:
     return _DIGITS.issuperset(text)
 
 
+def is_sha256(value: Any) -> bool:
+    """Whether ``value`` is a digest: 64 hexadecimal digits."""
+    return isinstance(value, str) and len(value) == 64 and is_hexadecimal(value)
+
+
 def file_digest(path: Path | str) -> str:
     """sha256 of a file's bytes.
 

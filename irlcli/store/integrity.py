@@ -148,7 +148,6 @@ def set_aside(layout: Layout, directory: Path) -> Path | None:
         FileNotFoundError: the artefact is missing.
         OSError: it cannot be moved.
     """
-    directory.lstat()
     layout.quarantine.mkdir(exist_ok=True)
     with repairing(layout):
         # Another process may have replaced it since the problem was seen.

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import IntegrityError, StageFailed, UsageError
-from irlcli.store.digest import is_hexadecimal
+from irlcli.store.digest import is_hexadecimal, is_sha256
 from irlcli.store.durable import unique_name, write_durably
 from irlcli.store.manifest import read_json
 
@@ -192,11 +192,6 @@ def is_prefix(text: str) -> bool:
     return _LEAST_DIGITS <= len(text) <= _KEY_DIGITS and is_hexadecimal(text)
 
 
-def is_key(text: str) -> bool:
-    """Whether ``text`` is a key: 64 hexadecimal digits."""
-    return len(text) == _KEY_DIGITS and is_hexadecimal(text)
-
-
 def is_name(text: str) -> bool:
     """Whether ``text`` has the form of a name: not that of an id's beginning."""
     return re.fullmatch(_NAME, text) is not None and not is_prefix(text)
@@ -208,7 +203,7 @@ def claims(layout: Layout) -> Iterator[tuple[Path, str]]:
         return
     for path in layout.keys.iterdir():
         id16 = pointed_to(path)
-        if is_key(path.name) and id16 is not None:
+        if is_sha256(path.name) and id16 is not None:
             yield path, id16
 
 

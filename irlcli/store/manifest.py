@@ -9,12 +9,12 @@ import errno
 import json
 import os
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from irlcli.errors import IntegrityError, NewerFormat
-from irlcli.store.digest import digest, file_digest, is_hexadecimal
+from irlcli.store.digest import digest, file_digest, is_sha256
 from irlcli.store.durable import open_plainly
 
 SCHEMA = 1
@@ -72,6 +72,11 @@ class Manifest(NamedTuple):
     def content(self) -> str:
         """sha256 of the outputs alone: the input of stages that read the whole artefact."""
         return content_digest(self.outputs)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all outputs."""
+        return sum(output.size for output in self.outputs)
 
     @property
     def id(self) -> str:
@@ -189,7 +194,7 @@ def _parse_manifest(value: Any) -> Manifest:
     if not isinstance(value["parameters"], dict) or not isinstance(value["inputs"], dict):
         raise ValueError("parameters or inputs is not an object")
     for role, sha in value["inputs"].items():
-        if not _is_sha256(sha):
+        if not is_sha256(sha):
             raise ValueError(f"input {role!r} is not a sha256")
     outputs = []
     if not isinstance(value["outputs"], list):
@@ -199,17 +204,13 @@ def _parse_manifest(value: Any) -> Manifest:
             raise ValueError("the keys of an output are not path, size, sha256")
         if type(item["size"]) is not int or item["size"] < 0:
             raise ValueError(f"output {item['path']!r} has no size")
-        if not _is_sha256(item["sha256"]):
+        if not is_sha256(item["sha256"]):
             raise ValueError(f"output {item['path']!r} has no sha256")
         outputs.append(Output(check_output_path(item["path"]), item["size"], item["sha256"]))
     if len({o.path for o in outputs}) != len(outputs):
         raise ValueError("an output path appears twice")
     record = KeyRecord(value["stage"], value["stage_version"], value["parameters"], value["inputs"])
     return Manifest(record, tuple(outputs))
-
-
-def _is_sha256(value: Any) -> bool:
-    return isinstance(value, str) and len(value) == 64 and is_hexadecimal(value)
 
 
 def check_output_path(path: Any) -> str:
@@ -258,4 +259,34 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
         raise IntegrityError(f"{path} was altered: its checksum does not match")
     if value["artefact"] != artefact_id:
         raise IntegrityError(f"{path} belongs to another artefact")
+    if not _is_provenance(value["record"]):
+        raise IntegrityError(f"{path} is malformed")
     return value["record"]
+
+
+# Of a provenance record, what the program reads. Each field may be absent, or null.
+_FORMS: dict[str, type | tuple[type, ...]] = {
+    "command": list,
+    "git": dict,
+    "attempts": list,
+    "libraries": dict,
+    "inputs": dict,
+    "seconds": (int, float),
+    "resumed": int,
+}
+
+
+def _is_provenance(record: Mapping[str, Any]) -> bool:
+    """Whether the fields of ``record`` are as a runner writes them."""
+    if not all(_is_of(record.get(name), kind) for name, kind in _FORMS.items()):
+        return False
+    texts = [*(record.get("command") or ()), *(record.get("inputs") or {}).values()]
+    states = [record.get("git") or {}, *(record.get("attempts") or ())]
+    return all(isinstance(text, str) for text in texts) and all(
+        isinstance(state, dict) and all(_is_of(state.get(n), str) for n in ("commit", "dirty"))
+        for state in states
+    )
+
+
+def _is_of(value: Any, kind: type | tuple[type, ...]) -> bool:
+    return value is None or isinstance(value, kind)

@@ -20,12 +20,12 @@ from irlcli.errors import IntegrityError, IrlError, NewerFormat, StageFailed, Us
 from irlcli.store import layout as layouts
 from irlcli.store import references
 from irlcli.store.artefact import Artefact, read_artefact, stored_inputs
+from irlcli.store.digest import is_sha256
 from irlcli.store.index import Index
 from irlcli.store.layout import (
     FORMAT,
     Layout,
     is_id,
-    is_key,
     is_name,
     is_prefix,
     pointed_to,
@@ -133,7 +133,7 @@ class Remote:
             NewerFormat: the artefact has a newer schema.
         """
         if self._keys is None:
-            self._keys = {name for name in self._list(".keys") if is_key(name)}
+            self._keys = {name for name in self._list(".keys") if is_sha256(name)}
         if key not in self._keys:
             return Peek()
         self._fetch([f".keys/{key}"])

@@ -37,7 +37,7 @@ class Shared(NamedTuple):
     @property
     def bytes(self) -> int:
         """Bytes of the outputs that were copied."""
-        return sum(map(size, self.copied))
+        return sum(artefact.manifest.size for artefact in self.copied)
 
 
 def share(
@@ -70,7 +70,7 @@ def share(
         held = {a.id for a in wanted if a.id in there and target.holds(a)}
         present = [a for a in wanted if a.id in held]
         copied = [a for a in wanted if a.id not in held]
-        advance = start(len(copied), sum(map(size, copied)))
+        advance = start(len(copied), sum(a.manifest.size for a in copied))
         diverged = {}
         for artefact in wanted:
             if artefact.id not in held:
@@ -85,11 +85,6 @@ def share(
     taken = {name: other for name, other in holders.items() if other is not None}
     given = {name: id16 for name, id16 in names.items() if name not in taken}
     return Shared(copied, present, given, taken, diverged)
-
-
-def size(artefact: Artefact) -> int:
-    """Bytes of the outputs."""
-    return sum(output.size for output in artefact.manifest.outputs)
 
 
 def _with_ancestors(

@@ -1,5 +1,6 @@
 """Stores that somebody else wrote: planted checkpoints, links that lead out, false summaries."""
 
+import hashlib
 import os
 import shutil
 from pathlib import Path
@@ -10,9 +11,10 @@ from chains import CHAIN, GRIDWORLD, SMOKE, assert_refused
 
 from irlcli.data.tensors import restore, to_bytes
 from irlcli.experiments import provenance
+from irlcli.experiments.circumstances import circumstances
 from irlcli.stages import train_maxent, transfer
 from irlcli.stages.base import Stage
-from irlcli.store import Store
+from irlcli.store import KeyRecord, Store
 from irlcli.store.durable import machine, remove
 
 
@@ -278,6 +280,43 @@ def test_huge_numbers_in_a_manifest_are_no_obstacle_to_listing(irl, publish, tmp
         for line in (["ls"], ["lineage", artefact.id], ["show", artefact.id]):
             done = irl(*line, "--store", store.root)
             assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        {"inputs": "abc"},
+        {"inputs": {"demonstrations": 3}},
+        {"attempts": "abc"},
+        {"attempts": ["x"]},
+        {"attempts": [{"commit": 1}]},
+        {"git": "x"},
+        {"git": {"dirty": []}},
+        {"libraries": "ab"},
+        {"command": "irl"},
+        {"command": ["irl", 3]},
+        {"seconds": "long"},
+        {"resumed": []},
+    ],
+)
+def test_a_provenance_of_another_form_is_named(irl, empty_store, origin):
+    """With valid digests."""
+    record = KeyRecord("train-airl", 1, {"seed": 0}, {})
+    with empty_store.in_use(), empty_store.working_on(record.key, wait=False) as scratch:
+        output = scratch.new_output()
+        (output / "reward.pt").write_bytes(b"reward")
+        made = empty_store.publish(record, output, origin).artefact
+    for command in ("lineage", "show"):
+        done = irl(command, made.id, "--store", empty_store.root)
+        assert_refused((done.code, done.out, done.err), 4, "provenance.json")
+
+
+def test_an_evaluation_that_was_made_from_itself_is_reported(irl, empty_store, publish):
+    files = {"summary.json": b"{}", "policy.pt": b"policy"}
+    inputs = {"policy": hashlib.sha256(b"policy").hexdigest()}
+    made = publish(empty_store, files, stage="evaluate", inputs=inputs).artefact
+    found = circumstances(made, empty_store.index())
+    assert found == {"evaluate.seed": 0}
 
 
 def planted(store: Store, source: str, name: str, data: bytes) -> None:

@@ -122,11 +122,10 @@ def _is_running(received: Sequence[int]) -> bool:
     To cancel, Slurm sends the same SIGTERM as before a preemption. submitit's local executor
     cancels by SIGTERM, and sends SIGUSR2 before a time limit.
     """
-    environment = os.environ
-    job = environment.get("SLURM_JOB_ID")
-    if "SLURM_ARRAY_TASK_ID" in environment:
+    job = os.environ.get("SLURM_JOB_ID")
+    if "SLURM_ARRAY_TASK_ID" in os.environ:
         # The last element has the array's own id, by which Slurm shows all of them.
-        job = f"{environment['SLURM_ARRAY_JOB_ID']}_{environment['SLURM_ARRAY_TASK_ID']}"
+        job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"
     if job is None:
         return signal.SIGTERM not in received
     done = subprocess.run(

@@ -62,7 +62,8 @@ class Submission:
         self._display = display
         self._ids: dict[str, str] = {}
         self._records: dict[str, Record] = {}
-        self._waiting: list[Array] = []
+        # Steps that wait for others, or for a free place.
+        self._unstarted: list[str] = []
         self._arrays: list[Array] = []
         self._record: Record | None = None
         # Steps whose jobs have not ended; since when they run, and are gone from the queue [s].
@@ -101,12 +102,12 @@ class Submission:
             absent = set(missing)
             needs = {name: [n for n in self._plan.needs[name] if n in absent] for name in new}
             self._arrays = job_arrays(needs)
-            self._waiting = list(self._arrays)
             self._record = new_record(store, self._queue.place)
             if self._queue.starts_what_waits:
                 for array in self._arrays:
                     self._submit(array.names, array.after, array.matching)
-                self._waiting = []
+            else:
+                self._unstarted = [name for array in self._arrays for name in array.names]
         return len(new)
 
     def watch(self) -> Outcome:
@@ -121,8 +122,8 @@ class Submission:
         self._alive = set(self._ids)
         self._started = answered = time.monotonic()
         with stop_requests(self._stop):
-            while (self._alive or self._waiting) and not self._stopped:
-                if self._waiting:
+            while (self._alive or self._unstarted) and not self._stopped:
+                if self._unstarted:
                     self._alive |= self._start_ready(len(self._alive))
                 try:
                     states = self._queue.states()
@@ -133,7 +134,7 @@ class Submission:
                     answered = time.monotonic()
                     self._poll(states, answered)
                     if not self._alive:
-                        if not any(map(self._ready, self._unstarted())):
+                        if not any(map(self._ready, self._unstarted)):
                             break
                         continue
                 self._pause(time.monotonic() - self._started)
@@ -216,20 +217,13 @@ class Submission:
         if matching is not None:
             array = self._ids[self._arrays[matching].names[0]].partition("_")[0]
         ids = self._queue.submit(jobs, self._record.logs, [self._ids[n] for n in after], array)
-        for name, job in zip(names, ids, strict=True):
-            self._ids[name] = job
-            self._records[name] = self._record
-        self._record.add(
-            [
-                Submitted(name, self._plan.identities[name], job)
-                for name, job in zip(names, ids, strict=True)
-            ]
-        )
-
-    def _unstarted(self) -> list[str]:
-        """The steps that wait for others, or for a free place."""
-        handled = {*self._ids, *self._outcome.made}
-        return [name for array in self._waiting for name in array.names if name not in handled]
+        submitted = [
+            Submitted(name, self._plan.identities[name], job)
+            for name, job in zip(names, ids, strict=True)
+        ]
+        for step in submitted:
+            self._ids[step.name], self._records[step.name] = step.job, self._record
+        self._record.add(submitted)
 
     def _ready(self, name: str) -> bool:
         return all(self._exists(need) for need in self._plan.needs[name])
@@ -239,7 +233,7 @@ class Submission:
 
         A step that another submission has started meanwhile is watched instead.
         """
-        ready = [name for name in self._unstarted() if self._ready(name)]
+        ready = [name for name in self._unstarted if self._ready(name)]
         started: set[str] = set()
         if ready and running < self._command.at_a_time:
             store = self._runner.store
@@ -258,8 +252,8 @@ class Submission:
                     else:
                         continue
                     started.add(name)
-        waiting = {*self._unstarted()}
-        self._waiting = [a for a in self._waiting if not waiting.isdisjoint(a.names)]
+        handled = {*self._ids, *self._outcome.made}
+        self._unstarted = [name for name in self._unstarted if name not in handled]
         return started
 
     def _ended(self, name: str, last: bool) -> bool:
