@@ -213,7 +213,8 @@ def run_jobs(
     queue = open_queue(session, options)
     if options.detach and not queue.starts_what_waits:
         raise UsageError(
-            f"--detach does not work with --cluster {queue.name}", "omit --detach: it must wait"
+            f"--detach does not work with --cluster {queue.name}",
+            "omit --detach: the command must run until all steps exist",
         )
     # A job that waits for another process would hold its node idle: it exits and is requeued.
     impatient = ["--no-wait"] if session.wait and queue.starts_what_waits else []

@@ -25,8 +25,8 @@ def collect_experts(
         list[str],
         typer.Option(
             metavar="SETTING=EXPERT",
-            help="Expert of a setting, instead of training one: policy.pt or its artefact, or a .zip "
-            "of stable-baselines3, or MODEL.zip+STATISTICS.pkl of one under VecNormalize. Repeatable.",
+            help="Use this expert in SETTING instead of training one: policy.pt or its artefact; a .zip "
+            "of stable-baselines3; or MODEL.zip+STATISTICS.pkl if it was trained under VecNormalize. Repeatable.",
         ),
     ] = [],  # noqa: B006
     trust: Annotated[

@@ -35,8 +35,8 @@ Rows = Annotated[
 ChoosePenalty = Annotated[
     str | None,
     typer.Option(
-        help="Candidates for lambda, e.g. 0.1,1,10, or own for each penalty's: chosen by leaving a "
-        "setting out."
+        help="Choose lambda among these candidates by leaving one training setting out, e.g. 0.1,1,10. "
+        "own: each penalty's own candidates."
     ),
 ]
 _Until = Annotated[

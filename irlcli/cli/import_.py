@@ -33,8 +33,8 @@ def import_(
     setting_column: Annotated[
         str | None,
         typer.Option(
-            help="Column, or key of an episode's metadata, that names its setting. Of several "
-            "settings in one source, by default `setting`."
+            help="Column, or key of an episode's metadata, that names its setting. Default "
+            "for one source of several settings: `setting`."
         ),
     ] = None,
     cut: Annotated[

@@ -91,7 +91,7 @@ class CuedMapsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     Attributes:
         seeds: draws of the maps, from ``first_seed``; smaller ones are for trying things out.
         value: of a good cell in the true reward, per step.
-        texture: share of the cells in which the texture tells the quality, in every setting.
+        texture: share of the cells in which the texture agrees with the quality, in every setting.
         strengths: the same share for the colour, in each setting trained on; ``unseen`` elsewhere.
         episodes: demonstrations per setting.
         warmup: iterations at lambda = 0.

@@ -207,8 +207,8 @@ def _challenger(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
         return replace(airl, challenger=_AIRL.challenger)
     if airl.logit != "f":
         raise UsageError(
-            f"airl.challenger.life = {airl.challenger.life} needs logits without log pi: past "
-            "challengers, whose log pi they would hold, are gone",
+            f"airl.challenger.life = {airl.challenger.life} needs logits without log pi: log "
+            "pi of past challengers is not available",
             "--set airl.logit=f, and --set airl.policy_reward to f or g",
         )
     # Before what follows from the number of worlds: a minibatch is at most a rollout.

@@ -1,4 +1,4 @@
-"""A small classifier with an invariance penalty: the ones that AIRL's discriminator is trained with.
+"""A small classifier, trained with the invariance penalties of AIRL's discriminator.
 
 A discriminator is a logistic classifier, so its penalties can be tried where their effect has been
 published. Nothing here is adversarial: the samples are fixed, all of them are in every step, and R

@@ -147,8 +147,7 @@ def judge(
     Args:
         value: of a good cell in the true reward, per step.
     """
-    each = np.broadcast_to(reward[:, None], (*maps.kinds.shape[:2], reward.shape[1]))
-    seen = np.take_along_axis(each, maps.kinds, axis=2)
+    seen = np.take_along_axis(reward[:, None], maps.kinds, axis=2)
     own = solve(settings, seen, horizon).occupancy
     expert = solve(settings, value * maps.quality, horizon).occupancy
     policy, _ = backward(settings, seen, horizon)

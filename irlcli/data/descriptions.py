@@ -327,7 +327,7 @@ class Assessment(Struct, frozen=True, kw_only=True):
 class HintContrast(Struct, frozen=True, kw_only=True):
     """How a reward depends on each hint of :mod:`irlcli.envs.cue` in one setting.
 
-    g with the hint at 1 minus g with the hint at -1, in standard deviations of g, mean over
+    the difference between g with the hint at 1 and g with the hint at -1, in standard deviations of g, mean over
     ``steps``.
     """
 

@@ -40,14 +40,12 @@ class Written(NamedTuple):
     Attributes:
         settings: index of the setting, by episode.
         lengths: number of steps, by episode.
-        returns: sum of the true rewards, by episode; NaN if unknown.
-        rewarded: whether the true rewards are known.
+        returns: sum of the true rewards, by episode; None if they are unknown.
     """
 
     settings: np.ndarray
     lengths: np.ndarray
-    returns: np.ndarray
-    rewarded: bool
+    returns: np.ndarray | None
 
 
 def write_stream(
@@ -122,7 +120,7 @@ def _write(
     schema = steps_schema(width, action_type(first.actions), rewarded)
     tags = file_metadata(env, metadata, schema)
     schema = schema.with_metadata(tags)
-    table = _EpisodeTable(width, rewarded)
+    table = _EpisodeTable(rewarded)
     with writer(directory / STEPS, schema, repeating) as file:
         for part in itertools.chain([first], parts):
             file.write_table(table.add(schema, part), row_group_size=max(1, len(part)))
@@ -134,8 +132,8 @@ def _write(
 class _EpisodeTable:
     """The episodes of a stream of steps, and the numbers of the one that is still open."""
 
-    def __init__(self, observation_size: int, rewarded: bool):
-        self._size, self._rewarded = observation_size, rewarded
+    def __init__(self, rewarded: bool):
+        self._rewarded = rewarded
         self._count = self._length = 0
         self._open_rewards: list[np.ndarray] = []
         self._returns: list[float] = []
@@ -210,8 +208,7 @@ class _EpisodeTable:
     def written(self) -> Written:
         """The episodes so far."""
         places, _, lengths, _, _ = self._columns()
-        returns = np.array(self._returns) if self._rewarded else np.full(len(places), np.nan)
-        return Written(places, lengths, returns, self._rewarded)
+        return Written(places, lengths, np.array(self._returns) if self._rewarded else None)
 
 
 def read_stream(directory: Path, size: int = PIECE) -> tuple[list[str], Iterator[Steps]]:

@@ -74,8 +74,13 @@ class Adapted(gymnasium.Wrapper):
             raise self._failed("step", error) from error
         if not abs(reward) <= _LARGEST_REWARD:
             raise self._wrong("step", f"returned the reward {reward}: it must be finite in float32")
-        ends = self._flag("terminated", terminated), self._flag("truncated", truncated)
-        return self._seen(observation, "step"), reward, *ends, self._reported(info)
+        info = self._reported(info)
+        terminated, truncated = (
+            self._flag("terminated", terminated),
+            self._flag("truncated", truncated),
+        )
+        truncated = truncated or info["error"] is not None
+        return self._seen(observation, "step"), reward, terminated, truncated, info
 
     @prints_aside()
     def close(self) -> None:

@@ -28,24 +28,18 @@ def elements(hind_legs_differ: bool) -> list[tuple[int, bool]]:
 
 
 def joints(turns: int, mirrored: bool) -> np.ndarray:
-    """The map of the joints [8, 8], hip and ankle of each leg, of one of :func:`elements`."""
-    return _turned(turns) @ (_reflected() if mirrored else np.eye(8))
+    """The map of the joints [8, 8], hip and ankle of each leg, of one of :func:`elements`.
+
+    After a reflection hips turn the other way, and ankles bend the same way.
+    """
+    turned = _moved([(leg + turns) % 4 for leg in range(4)], 1.0)
+    return turned @ (_moved(_OPPOSITE, -1.0) if mirrored else np.eye(8))
 
 
-def _turned(turns: int) -> np.ndarray:
-    """Leg ``k`` becomes what leg ``k + turns`` was [8, 8]."""
+def _moved(olds: list[int], hips: float) -> np.ndarray:
+    """Each leg becomes what the one in ``olds`` was [8, 8]; ``hips`` is the sign of the hips' angles."""
     matrix = np.zeros((8, 8))
-    for leg in range(4):
-        old = (leg + turns) % 4
-        matrix[2 * leg, 2 * old] = 1.0
-        matrix[2 * leg + 1, 2 * old + 1] = _ANKLES[leg] * _ANKLES[old]
-    return matrix
-
-
-def _reflected() -> np.ndarray:
-    """Left legs become right legs [8, 8]: hips turn the other way, ankles bend the same way."""
-    matrix = np.zeros((8, 8))
-    for leg, old in enumerate(_OPPOSITE):
-        matrix[2 * leg, 2 * old] = -1.0
+    for leg, old in enumerate(olds):
+        matrix[2 * leg, 2 * old] = hips
         matrix[2 * leg + 1, 2 * old + 1] = _ANKLES[leg] * _ANKLES[old]
     return matrix

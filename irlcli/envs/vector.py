@@ -86,7 +86,6 @@ class VectorWorlds:
             if "progress" in info:
                 before = 0.0 if np.isnan(self._progress[i]) else self._progress[i]
                 self._progress[i] = before + info["progress"]
-            truncated = truncated or info.get("error") is not None
             if terminated or truncated or self._lengths[i] >= self.max_episode_steps:
                 ended.append(
                     Ended(

@@ -139,7 +139,6 @@ class WorkerWorlds:
         self.observation_space = sample.observation_space
         self.action_space = sample.action_space
         sample.close()
-        self.max_episode_steps = max_episode_steps
         self._size = len(factories)
         action_shape = (self._size, *(self.action_space.shape or ()))
         observation_shape = (self._size, *(self.observation_space.shape or ()))

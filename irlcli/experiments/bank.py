@@ -1,6 +1,6 @@
 """The bank of policies that a learned reward is assessed on: which there are, and where.
 
-Idle and random agents, a ladder of noise on a clone of the demonstrations, the reward's student,
+Idle and random agents, a clone of the demonstrations at several noise levels, the reward's student,
 experts, and policies retrained on the reward. Nothing here trains an expert or a retrained policy:
 those that exist are measured.
 """

@@ -223,8 +223,8 @@ class Runner:
         published = self.store.publish(record, output, origin)
         if published.diverged is not None:
             self.console.warn(
-                f"{request.label} gave other bytes than {published.diverged.id}, which holds the "
-                f"key: this result is kept as {published.artefact.id}"
+                f"{request.label} differs from {published.diverged.id}, the stored result of the same "
+                f"request, which commands continue to use; the new result is kept as {published.artefact.id}"
             )
         self.console.finish(request.label, published.artefact, hit=False)
         if checkpoints.stop_requested:

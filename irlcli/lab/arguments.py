@@ -175,14 +175,20 @@ def _element(value: Any) -> str:
 
 def listed(given: Any) -> list[Any]:
     """One value, or several, as a list."""
-    return [given] if isinstance(given, str | Path) else list(given)
+    return [given] if isinstance(given, str | os.PathLike) else list(given)
 
 
 def joined(given: Any) -> str | None:
     """One value, or several, as the options with commas take them."""
-    if given is None or isinstance(given, str):
-        return given
-    return ",".join(map(str, given)) if isinstance(given, Sequence) else str(given)
+    if given is None:
+        return None
+    several = isinstance(given, Sequence) and not isinstance(given, str)
+    return ",".join(map(text_of, given if several else [given]))
+
+
+def text_of(given: Any) -> str:
+    """A path, a number or text as an option takes it."""
+    return os.fspath(given) if isinstance(given, os.PathLike) else str(given)
 
 
 def number(name: str, given: float | None) -> float | None:

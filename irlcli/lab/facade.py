@@ -18,6 +18,7 @@ from irlcli.lab.arguments import (
     number,
     overrides,
     plainly,
+    text_of,
     whole,
     words,
 )
@@ -76,7 +77,7 @@ class Lab:
         self.settings = settings
         self.set = overrides(set)
         overridden(self.set)
-        self.sources = [str(source) for source in listed(from_)]
+        self.sources = [text_of(source) for source in listed(from_)]
         self.workers = whole("workers", workers, 1)
         self.wait = wait
         self._console = console(quiet)
@@ -153,7 +154,7 @@ class Lab:
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """
         options = self._options(locals())
-        sources = [str(source) for source in listed(options.pop("recordings"))]
+        sources = [text_of(source) for source in listed(options.pop("recordings"))]
         with self._at_work(configs, words("import", options, *sources)) as session:
             request = collect.import_demonstrations(session, recordings=sources, **options)
             return self._run(session, request, name)
@@ -315,7 +316,7 @@ class Lab:
         Args:
             reward: a learned reward.
             ood, intervention, setting: settings; by default those the reward was learned in.
-            demos: demonstrations for the ladder of noise; by default the reward's own.
+            demos: demonstrations to clone for the bank; by default the reward's own.
             env: TOML file of the environment, for a reward outside the store.
             episodes: of each policy.
             seed: of the episodes.
@@ -430,5 +431,5 @@ class Lab:
 
     def _ref(self, ref: Ref) -> str:
         if not isinstance(ref, Stored):
-            return str(ref)
+            return text_of(ref)
         return ref.id if ref.path.parent == self.store else str(ref.path)

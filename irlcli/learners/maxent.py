@@ -246,7 +246,6 @@ class MaxEnt:
         self._solution = solution
         visits = self._visits(solution.occupancy)
         gap = np.einsum("rke,rkes->rks", risks.shares, risks.occupancy - visits[:, None])
-        likelihood = np.einsum("res,rs->re", self._expert, phi) - solution.log_partition
         each = np.einsum("rkes,rs->rke", risks.occupancy, phi) - solution.log_partition[:, None]
 
         def response() -> np.ndarray:
@@ -265,6 +264,7 @@ class MaxEnt:
                 Occupancies(phi, gap, risks.weights, negative, response, weight)
             )
         if record:
+            likelihood = np.einsum("res,rs->re", self._expert, phi) - solution.log_partition
             total = (risks.weights * penalty).sum(-1)
             distance = np.abs(self._expert - visits).sum(-1)
             self.records.append(Record(self.iterations, likelihood, total, distance))
@@ -296,8 +296,7 @@ class MaxEnt:
         """The policies of ``phi`` [R, T] in every setting."""
         reward = phi
         if self._kinds is not None:
-            each = np.broadcast_to(phi[:, None], (len(phi), self._kinds.shape[1], phi.shape[1]))
-            reward = np.take_along_axis(each, self._kinds, axis=2)
+            reward = np.take_along_axis(phi[:, None], self._kinds, axis=2)
         return solve(self._settings, reward, self._horizon, reuse=reuse)
 
     def _visits(self, occupancy: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """IGA: the variance of the gradients of the settings' risks.
 
 Koyama and Yamaguchi (2020), "When is invariance useful in an out-of-distribution generalization
-problem?" (arXiv 2008.01883), inter-environmental gradient alignment: in an invariant predictor no
-setting pulls the weights another way than the others.
+problem?" (arXiv 2008.01883), inter-environmental gradient alignment: in an invariant predictor the
+gradients of all settings' risks are equal.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """IRMv1: the squared gradient of a setting's risk by a scale w at w = 1.
 
-Arjovsky et al. (2019), as the paper's Eqs. 4-5 and 9 use it: a predictor is invariant if no
-setting would rather rescale its output.
+Arjovsky et al. (2019), as the paper's Eqs. 4-5 and 9 use it: a predictor is invariant if
+rescaling its output lowers the risk of no setting.
 """
 
 from __future__ import annotations

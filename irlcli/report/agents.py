@@ -10,7 +10,7 @@ BASELINES = {
 }
 MEASURES = {
     "transfer": "Transfer: the policy retrained on the frozen reward, in the held-out setting",
-    "from-student": "From the student: retrained from the student on, in the held-out setting",
+    "from-student": "From the student: the student, retrained on the frozen reward, in the held-out setting",
     "zero-shot": "Zero-shot: the student, in the held-out setting",
     "transfer-id": "Transfer in distribution: a policy retrained in each training setting, their mean",
     "id": "In distribution: the student, mean over the training settings",

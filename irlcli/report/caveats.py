@@ -91,8 +91,8 @@ def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -
         expert, reused = (means.get((row.name, agent)) for agent in ("expert", "reused"))
         if expert is not None and reused is not None and reused > expert:
             found.append(
-                f"Weak expert: {row.name}: the training experts earn {reused:.1f} in {row.unseen}, its own "
-                f"expert {expert:.1f}, so that is not the best policy known there."
+                f"Weak expert: {row.name}: the training experts earn {reused:.1f} in {row.unseen}, that "
+                f"setting's own expert {expert:.1f}, so a better policy than this expert is known."
             )
     return found
 

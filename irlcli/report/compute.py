@@ -275,16 +275,8 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return;
     ``uncertain``, the verdicts that rest on differences within two standard errors.
     """
-    counted = [
-        "seeds",
-        "judged",
-        "retrained",
-        "expert",
-        "short",
-        "short_scored_higher",
-        "uncertain",
-    ]
-    columns = ["row", "agent", *counted]
+    columns = ["row", "agent", "seeds", "judged", "retrained", "expert"]
+    columns += ["short", "short_scored_higher", "uncertain"]
     found = []
     for row in p.rows if "transfer" in p.measures else ():
         random = sample(points, row.name, "random", "ood")["true_return"].mean()

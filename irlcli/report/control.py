@@ -82,7 +82,7 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
         "Cells are means with bootstrap 95 % intervals. The number after a method is its lambda. "
         "All measures are in `control.csv`; [what they mean](../../when-invariance-helps.md).",
         "## Colored MNIST without images",
-        f"{c.seeds} seeds. The digit tells the label in {_percents([1 - c.noise])}, the colour in "
+        f"{c.seeds} seeds. The digit agrees with the label in {_percents([1 - c.noise])}, the colour in "
         f"{_percents(c.strengths)} of the samples of the settings trained on, and in {_percents([c.unseen])} "
         "of the unseen one. Published, with images: ERM 0.87 and 0.17, IRM 0.71 and 0.67, the "
         "invariant optimum 0.75 and 0.75 (Arjovsky et al. 2019, Sec. 5.2).",
@@ -92,7 +92,7 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
         ),
         "## Linear unit tests",
         f"{c.seeds} seeds, linear classifiers, three settings (Aubin et al. 2021). Accuracy where "
-        "the spurious inputs tell nothing; 0.5 is chance. The oracle learned from such samples.",
+        "the spurious inputs are uninformative; 0.5 is chance. The oracle learned from such samples.",
         markdown_table(
             ["method", "cows and camels", "small margin"],
             [
@@ -106,7 +106,7 @@ def page(summarised: pd.DataFrame, chosen: pd.DataFrame, control: ControlConfig)
         ),
         "## Maps",
         f"{m.seeds} draws of maps of {m.size}x{m.size} cells, {m.episodes} demonstrations of {m.horizon} "
-        f"steps a setting. The texture tells a cell's quality in {_percents([m.texture])} of the cells, the "
+        f"steps a setting. The texture agrees with a cell's quality in {_percents([m.texture])} of the cells, the "
         f"colour in {_percents(m.strengths)} in the settings trained on, and in {_percents([m.unseen])} in the "
         "unseen one, where all columns but the last two are measured. A quality of 0.5 is chance.",
     ]

@@ -108,7 +108,7 @@ def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float
         for row in found.itertuples()
         if (bar := bars.get(f"{row.env} {row.knob}")) is not None and row.true_return < bar
     ]
-    sentences = [f"Below their bar, so not yet experts: {', '.join(low)}."] if low else []
+    sentences = [f"Experts below their bar: {', '.join(low)}."] if low else []
     if missing:
         sentences.append(
             f"Missing: the evaluations of {len(missing)} of {len(experts)} experts: {', '.join(missing)}."
@@ -145,8 +145,12 @@ def draw(directory: Path, cells: Sequence[Cell], learning: Mapping[str, pd.DataF
     with matplotlib.rc_context(
         {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
     ):
-        figure, axes = panels(len(curves), 2, (9, 0.4 + 1.9 * len(curves)))
-        for line, (row, experts) in zip(axes, curves.items(), strict=True):
+        # Experts that another store holds have an evaluation here, but no curve.
+        figure, axes = panels(max(1, len(curves)), 2, (9, 0.4 + 1.9 * len(curves)))
+        if not curves:
+            for axis in axes.flat:
+                axis.set_axis_off()
+        for line, (row, experts) in zip(axes, curves.items(), strict=bool(curves)):
             for axis, name in zip(line, ("true_return", "progress"), strict=True):
                 _panel(axis, f"{row}: {name.replace('_', ' ')}", name, experts)
             line[0].legend(frameon=False, fontsize=7)

@@ -192,17 +192,8 @@ def _seeds(report: Report) -> Table:
         ]
         for point in report.points.itertuples()
     ]
-    columns = [
-        "row",
-        "agent",
-        "measure",
-        "seed",
-        "retraining",
-        "setting",
-        "true return",
-        "progress",
-    ]
-    columns += ["learned return", "episodes", "evaluation"]
+    columns = ["row", "agent", "measure", "seed", "retraining", "setting"]
+    columns += ["true return", "progress", "learned return", "episodes", "evaluation"]
     note = "Means over the episodes of an evaluation."
     return Table("Every seed in numbers", note, columns, rows, 6)
 

@@ -21,8 +21,9 @@ from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
 from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
-    "Mean true return ± standard deviation over seeds. Training experts, reused: the experts of the training settings, each evaluated where the students "
-    "are, their mean: the return without learning a reward."
+    "Mean true return ± standard deviation over seeds. Training experts, reused: the mean over the "
+    "experts of the training settings, each evaluated in the settings in which the students are evaluated. This is the return "
+    "without learning a reward."
 )
 _TEST_NOTE = (
     f"p: Welch's test, {title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a "
@@ -61,8 +62,8 @@ _LEARNED_NOTE = (
     "meaning."
 )
 _QUALITY_NOTE = (
-    "How well the frozen reward ranks a bank of policies (idle, random, a ladder of noise on a clone "
-    "of the demonstrations, student, experts, retrained policy): Spearman's correlation of learned "
+    "How well the frozen reward ranks a bank of policies (idle, random, a clone of the demonstrations "
+    "at several noise levels, student, experts, retrained policy): Spearman's correlation of learned "
     "with true return, over the bank and over the half with the lower true returns, median over seeds "
     "(least to largest). Expert - idle: learned reward per step, in standard deviations of g, median "
     "over seeds. The next three count the policies retrained from scratch by verdict: retrained, if the "

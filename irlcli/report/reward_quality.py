@@ -34,7 +34,7 @@ class Member(NamedTuple):
 
     Attributes:
         policy: its name; one policy has the same name in every setting.
-        kind: ``idle``, ``random``, ``clone`` (the ladder of noise), ``student``, ``expert`` (the
+        kind: ``idle``, ``random``, ``clone`` (at several noise levels), ``student``, ``expert`` (the
             setting's own), ``reused`` (that of another setting), ``retrained`` or
             ``from-student`` (retrained from the student on).
         true, learned: returns [n] of the same n episodes.

@@ -62,7 +62,7 @@ def assess(
     policies = finder.policies(source, origin, settings, shown, cloned, seed)
     if shown is None:
         session.console.warn(
-            "no ladder of noise: the store does not hold what this reward was learned from; "
+            "the bank has no noisy clones: the store lacks the demonstrations that this reward was learned from; "
             "name demonstrations with --demos"
         )
     _warn_of_missing_experts(session, origin.env, settings, policies)

@@ -1,8 +1,8 @@
 """Policies that start again and again from random weights while a reward is learned.
 
-Each is trained on the reward of that moment, as a retrained policy will be on the final one. What
-they do becomes negatives of the discriminator. So the reward rises from where a new policy begins,
-and poses that it would score too high are corrected before it is frozen.
+Each is trained on the reward of that moment, as a retrained policy will be on the final one. The
+discriminator sees their episodes as policy samples. The reward therefore rises from where a new
+policy begins, and poses that the reward scores too high are corrected before it is frozen.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ class RunningDeviation:
     def __init__(self, gamma: float, worlds: int):
         self._gamma = gamma
         self._sums = np.zeros(worlds)
-        self._moments = RunningMeanStd()
-        self.load_state([0.0, 1.0, 0.0])
+        # SB3 would begin with a small count of sums that nobody saw.
+        self._moments = RunningMeanStd(epsilon=0.0)
 
     def begin(self) -> None:
         """New episodes start in every world."""

@@ -116,7 +116,7 @@ def _run_batch(
             observations[i].append(np.asarray(observation, dtype=np.float32))
             actions[i].append(action)
             rewards[i].append(float(reward))
-            truncated = truncated or errors[i] is not None or len(rewards[i]) >= limit
+            truncated = truncated or len(rewards[i]) >= limit
             ends[i] = (bool(terminated), bool(truncated and not terminated))
             if not (terminated or truncated):
                 still.append(i)

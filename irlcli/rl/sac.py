@@ -194,13 +194,12 @@ class SACTrainer:
 
     @property
     def _optimizers(self) -> dict[str, Any]:
-        model = self.model
-        found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
-        return (
-            found
-            if model.ent_coef_optimizer is None
-            else found | {"temperature": model.ent_coef_optimizer}
-        )
+        found = {
+            "actor": self.model.actor.optimizer,
+            "critic": self.model.critic.optimizer,
+            "temperature": self.model.ent_coef_optimizer,
+        }
+        return {name: optimizer for name, optimizer in found.items() if optimizer is not None}
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed run needs from the end of the last round (tensors, numbers)."""

@@ -114,7 +114,7 @@ def _check_experts(
         if setting not in settings:
             names = ", ".join(str(s) for s in settings)
             raise UsageError(
-                f"an expert of {setting} is given, but demonstrations of {names} are asked for",
+                f"--expert names {setting}, which is not among the settings to demonstrate: {names}",
                 "name experts of these settings only",
             )
         if environment(env).tabular:

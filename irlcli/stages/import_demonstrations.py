@@ -163,7 +163,7 @@ def _reader(form: Form) -> Callable[[Path, Expected], Iterator[Steps]]:
 
 
 def _report(job: Job, irregular: Irregular, written: Written) -> None:
-    if not written.rewarded:
+    if written.returns is None:
         job.console.warn("the demonstrations hold no true reward: their returns are unknown")
     for count, what in (
         (irregular.long, "longer than the time limit, cut there"),
@@ -178,7 +178,7 @@ def _report(job: Job, irregular: Irregular, written: Written) -> None:
 def _means(index: int, text: str, written: Written) -> dict[str, Any]:
     """The means of the episodes in one setting, as ``summary.json`` has them."""
     mine = written.settings == index
-    returns = written.returns[mine] if written.rewarded else None
+    returns = None if written.returns is None else written.returns[mine]
     return means_of(text, returns, written.lengths[mine])
 
 

@@ -72,4 +72,4 @@ def run(job: Job) -> None:
     experts.draw(job.output, p.cells, learning)
 
 
-STAGE = Stage("report-experts", 4, run)
+STAGE = Stage("report-experts", 5, run)

@@ -47,7 +47,7 @@ def request(
     """A policy trained on ``reward`` (a ``reward.pt``) in ``setting``.
 
     It begins at random, or as ``start``: the ``policy.pt`` of the student that was trained while
-    the reward was learned. ``reward_label`` tells in the label how the reward was learned; it is
+    the reward was learned. The label names ``reward_label``: how the reward was learned. It is
     not part of the identity.
 
     Outputs ``policy.pt``, ``policy.json`` and ``metrics.parquet``.

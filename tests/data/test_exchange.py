@@ -132,7 +132,7 @@ def test_without_a_reward_no_return_is_known(tmp_path):
     made = table([episode(rng, 3, rewards=False), episode(rng, 4, rewards=False)])
     pq.write_table(made, tmp_path / "a.parquet")
     demos, written, _ = imported(tmp_path / "a", tmp_path / "a.parquet")
-    assert not written.rewarded
+    assert written.returns is None
     assert all(np.isnan(t.episode_return) for g in demos.trajectories.values() for t in g)
     assert "reward" not in pq.read_schema(tmp_path / "a" / "steps.parquet").names
     assert "return" not in pq.read_schema(tmp_path / "a" / "episodes.parquet").names

@@ -61,10 +61,10 @@ class Breaking(gymnasium.Env):
         info = {"progress": 1.5} if self.steps > 1 else {}
         if self.steps == 3:
             info["error"] = "the simulation broke"
-        return np.zeros(1, np.float32), 1.0, False, False, info
+        return np.zeros(1, np.float32), 1.0, False, self.steps == 3, info
 
 
-def test_an_error_ends_the_episode():
+def test_the_error_that_ended_an_episode_is_kept():
     worlds = VectorWorlds([Breaking()], max_episode_steps=9)
     worlds.reset([0])
     (end,) = [end for _ in range(4) for end in worlds.step(np.zeros(1, int))[2]]

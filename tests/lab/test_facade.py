@@ -195,6 +195,15 @@ def test_settings_may_be_lists(lab):
     ]
 
 
+def test_a_path_may_be_any_path_like_object(lab, tmp_path):
+    class Place:
+        def __fspath__(self):
+            return str(lab.store)
+
+    new = irlcli.Lab(tmp_path / "new", profile="smoke", from_=Place())
+    assert new.collect_experts("lunar-lander", "engine-power=1x,1.25x").path.parent == new.store
+
+
 def test_a_plan_says_what_irl_plan_says(lab, irl):
     choice = {"seeds": [0], "methods": ["irm"], "rows": "lunar-lander"}
     new = lab.store.parent / "new"

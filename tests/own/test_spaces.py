@@ -230,8 +230,9 @@ def test_a_progress_is_a_number_and_an_error_is_text():
 
     world = Adapted(Telling(), "telling")
     world.reset(seed=0)
-    info = world.step(np.zeros(1))[-1]
+    *_, truncated, info = world.step(np.zeros(1))
     assert info == {"progress": 0.5, "error": "fell", "other": 1}
+    assert truncated
 
 
 def test_flat_observations_and_actions_of_any_shape(bench):

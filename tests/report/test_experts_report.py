@@ -65,5 +65,10 @@ def test_an_intervention_may_hold_no_value_out(tmp_path):
     page = experts.markdown("irl report experts", experts.text_table(found), [])
     assert "| lunar-lander bounce=0.1 | trained in | 250 ± 5 |" in page
     curve = pd.DataFrame({"steps": [0, 1000], "true_return": [0.0, 1.0], "progress": [None] * 2})
-    experts.draw(tmp_path, cells, {"lunar-lander bounce=0.1 learning": curve})
-    assert {file.name for file in tmp_path.iterdir()} == {"experts.png", "experts.pdf"}
+    for place, curves in (("one", {"lunar-lander bounce=0.1 learning": curve}), ("none", {})):
+        (tmp_path / place).mkdir()
+        experts.draw(tmp_path / place, cells, curves)
+        assert {file.name for file in (tmp_path / place).iterdir()} == {
+            "experts.png",
+            "experts.pdf",
+        }

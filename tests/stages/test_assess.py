@@ -257,7 +257,7 @@ def test_a_reward_without_its_store_has_a_ladder_only_with_demos(smoke_store, ir
     store = tmp_path / "runs"
     line = ["assess", tmp_path / "reward.pt", "--intervention", "engine-power=1x", *SMOKE]
     alone = irl(*line, "--store", store, "--dry-run")
-    assert "no ladder of noise" in alone.err and "--demos" in alone.err
+    assert "no noisy clones" in alone.err and "--demos" in alone.err
     assert "clone" not in alone.out and "record idle" in alone.out
     demos = smoke_store.path / smoke_store.demos
     given = irl(*line, "--store", store, "--demos", demos, "--dry-run")

@@ -42,7 +42,7 @@ def read_transitions(path: Path, expected: Expected, size: int = PIECE) -> Itera
     try:
         with open_table(path) as file:
             columns = _columns(path, file.schema_arrow.names, expected)
-            episodes = _EpisodeStarts(path)
+            episodes = _EpisodeStarts()
             done = 0
             for batch in batches(file, size, columns):
                 if batch.num_rows:
@@ -152,8 +152,7 @@ def _check_settings(column: pa.Array, expected: Expected, place: Locate) -> None
 class _EpisodeStarts:
     """Which rows begin an episode: those with another number, or that follow an end."""
 
-    def __init__(self, path: Path):
-        self._path = path
+    def __init__(self) -> None:
         self._seen: set[Any] = set()
         self._last: Any = None
         self._ended = True
