@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import dropout
 
-from irlcli.controls.variants import Method
+from irlcli.controls.methods import LabelMethod
 from irlcli.penalties import (
     PENALTIES,
     PenaltyOptions,
@@ -66,7 +66,11 @@ class Networks(torch.nn.Module):
 
 
 def train(
-    samples: torch.Tensor, method: Method, schedule: Schedule, hidden: int, seeds: Sequence[int]
+    samples: torch.Tensor,
+    method: LabelMethod,
+    schedule: Schedule,
+    hidden: int,
+    seeds: Sequence[int],
 ) -> Networks:
     """Minimise (mean_e R_e + lambda penalty) / max(1, lambda) by Adam, full batch.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from irlcli.configs.exact import CuedMapsConfig
 from irlcli.controls.cued_maps import (
-    Judgement,
+    MapQuality,
     Maps,
     demonstrate,
     draw,
@@ -17,9 +17,9 @@ from irlcli.controls.cued_maps import (
     judge,
     torus,
 )
-from irlcli.controls.variants import Variant
+from irlcli.controls.methods import MapMethod
 from irlcli.learners.maxent import MaxEnt, Risks, group_risks
-from irlcli.learners.occupancy import Demonstrations
+from irlcli.learners.occupancy import IndexedDemonstrations
 from irlcli.learners.soft_values import solve
 
 
@@ -27,7 +27,7 @@ class Dataset(NamedTuple):
     """What S runs learn from: maps of E settings with C colours, and demonstrations in them."""
 
     maps: Maps
-    demos: list[Demonstrations]
+    demos: list[IndexedDemonstrations]
     colours: int
 
 
@@ -44,7 +44,7 @@ def without(data: Dataset, left_out: int) -> Dataset:
     """``data`` without one of its settings."""
     kept = [e for e in range(data.maps.kinds.shape[1]) if e != left_out]
     demos = [
-        Demonstrations(tuple(d.states[e] for e in kept), tuple(d.actions[e] for e in kept))
+        IndexedDemonstrations(tuple(d.states[e] for e in kept), tuple(d.actions[e] for e in kept))
         for d in data.demos
     ]
     maps = Maps(data.maps.quality[:, kept], data.maps.kinds[:, kept])
@@ -68,7 +68,7 @@ class Fitted(NamedTuple):
 def fit(
     config: CuedMapsConfig,
     data: Dataset,
-    variants: Sequence[Variant],
+    variants: Sequence[MapMethod],
     hidden: int,
     seeds: Sequence[int],
 ) -> Fitted:
@@ -82,7 +82,7 @@ def fit(
         for r, (demos, seed) in enumerate(zip(data.demos, seeds, strict=True)):
             risks[grouping, r] = group_risks(settings, demos, grouping, config.horizon, seed)
     inputs = features(data.colours)
-    results: dict[Variant, tuple[np.ndarray, ...]] = {}
+    results: dict[MapMethod, tuple[np.ndarray, ...]] = {}
     shared = dict.fromkeys((v.penalty, v.warm, v.sees) for v in variants)
     for penalty, warm, sees in shared:
         chosen = [v for v in variants if (v.penalty, v.warm, v.sees) == (penalty, warm, sees)]
@@ -109,13 +109,15 @@ def fit(
     return Fitted(*map(np.stack, zip(*(results[v] for v in variants), strict=True)))
 
 
-def unseen(config: CuedMapsConfig, fitted: Fitted, seeds: Sequence[int], colours: int) -> Judgement:
+def unseen(
+    config: CuedMapsConfig, fitted: Fitted, seeds: Sequence[int], colours: int
+) -> MapQuality:
     """How the rewards do in maps of the unseen setting; each field [V, S]."""
     strengths = np.full((len(seeds), config.unseen_maps, colours), config.unseen)
     maps = draw(seeds, config.size, config.texture, strengths, purpose=1)
     settings = torus(config.size, config.unseen_maps)
     each = [judge(settings, maps, r, config.value, config.horizon) for r in fitted.reward]
-    return Judgement(*map(np.stack, zip(*each, strict=True)))
+    return MapQuality(*map(np.stack, zip(*each, strict=True)))
 
 
 def held_out_risk(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from irlcli.learners.occupancy import Demonstrations
+from irlcli.learners.occupancy import IndexedDemonstrations
 from irlcli.learners.soft_values import solve
 from irlcli.tabular import StackedMDPs, TabularMDP, backward, forward, stack
 
@@ -104,7 +104,7 @@ def torus(size: int, settings: int) -> StackedMDPs:
 
 def demonstrate(
     settings: StackedMDPs, reward: np.ndarray, horizon: int, episodes: int, seeds: Sequence[int]
-) -> list[Demonstrations]:
+) -> list[IndexedDemonstrations]:
     """``episodes`` of experts that are soft-optimal for ``reward`` [R, E, S], for each run.
 
     The episodes of a run depend on its seed and on its own maps only.
@@ -122,11 +122,11 @@ def demonstrate(
             draw = rng.random((e, episodes, 1))
             chosen[..., t] = (probability.cumsum(-1) < draw).sum(-1).clip(max=actions - 1)
             states[..., t + 1] = settings.mdps[0].afterstate[chosen[..., t], states[..., t]]
-        found.append(Demonstrations(tuple(map(tuple, states)), tuple(map(tuple, chosen))))
+        found.append(IndexedDemonstrations(tuple(map(tuple, states)), tuple(map(tuple, chosen))))
     return found
 
 
-class Judgement(NamedTuple):
+class MapQuality(NamedTuple):
     """How R rewards do in M maps each, all [R].
 
     ``quality`` is the mean quality of the cells that the maximum-entropy policy of the reward
@@ -141,7 +141,7 @@ class Judgement(NamedTuple):
 
 def judge(
     settings: StackedMDPs, maps: Maps, reward: np.ndarray, value: float, horizon: int
-) -> Judgement:
+) -> MapQuality:
     """Plan on ``reward`` [R, T] in ``maps`` [R, M, S] and visit.
 
     Args:
@@ -157,4 +157,4 @@ def judge(
         for occupancy in (own, best, expert)
     )
     difference = value * (horizon + 1) * (expert_quality - quality)
-    return Judgement(quality, best_quality, difference)
+    return MapQuality(quality, best_quality, difference)

@@ -22,7 +22,7 @@ import torch
 
 from irlcli.errors import StageFailed
 from irlcli.learners.grouping import Group, group
-from irlcli.learners.occupancy import Demonstrations, mean_occupancy
+from irlcli.learners.occupancy import IndexedDemonstrations, mean_occupancy
 from irlcli.learners.soft_values import Solution, solve
 from irlcli.networks import all_finite
 from irlcli.penalties import Occupancies, loss_divisor, occupancy_penalty
@@ -65,7 +65,7 @@ class Risks(NamedTuple):
 
 def group_risks(
     settings: StackedMDPs,
-    demos: Demonstrations,
+    demos: IndexedDemonstrations,
     grouping: str,
     horizon: int,
     seed: int,

@@ -11,7 +11,7 @@ from irlcli.tabular import StackedMDPs, TabularMDP
 
 
 @dataclass(frozen=True, eq=False)
-class Demonstrations:
+class IndexedDemonstrations:
     """The demonstrations of E settings, as state and action indices.
 
     Attributes:
@@ -33,7 +33,7 @@ def demonstrations(
     states: Sequence[Sequence[np.ndarray]],
     actions: Sequence[Sequence[np.ndarray]],
     horizon: int,
-) -> Demonstrations:
+) -> IndexedDemonstrations:
     """Check demonstrations and cut each one where it first reaches the goal.
 
     The MDP determines what happens after that: an absorbing goal is occupied until the horizon, a
@@ -76,13 +76,13 @@ def demonstrations(
             moves.append(np.asarray(chosen[:length], dtype=np.int64))
         cut_states.append(tuple(paths))
         cut_actions.append(tuple(moves))
-    return Demonstrations(tuple(cut_states), tuple(cut_actions))
+    return IndexedDemonstrations(tuple(cut_states), tuple(cut_actions))
 
 
 def mean_occupancy(mdp: TabularMDP, paths: Sequence[np.ndarray], horizon: int) -> np.ndarray:
     """rho_E [S]: visits of each state, averaged over ``paths`` of state indices.
 
-    ``paths`` are those of :class:`Demonstrations`: each ends at the goal or at the horizon.
+    ``paths`` are those of :class:`IndexedDemonstrations`: each ends at the goal or at the horizon.
     """
     occupancy = np.zeros(mdp.n_states)
     for path in paths:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import spearmanr
 
-from irlcli.learners.occupancy import Demonstrations
+from irlcli.learners.occupancy import IndexedDemonstrations
 from irlcli.learners.soft_values import Solution, solve
 from irlcli.tabular import StackedMDPs, backward, evaluate, forward, true_reward
 
@@ -33,7 +33,7 @@ class Quality:
 
 
 def assess(
-    settings: StackedMDPs, reward: np.ndarray, horizon: int, held_out: Demonstrations
+    settings: StackedMDPs, reward: np.ndarray, horizon: int, held_out: IndexedDemonstrations
 ) -> Quality:
     """Judge ``reward`` [R, S] in each of E settings.
 
@@ -64,7 +64,7 @@ def assess(
     )
 
 
-def log_likelihood(solution: Solution, run: int, demos: Demonstrations) -> np.ndarray:
+def log_likelihood(solution: Solution, run: int, demos: IndexedDemonstrations) -> np.ndarray:
     """sum_t log pi_t(a_t|s_t) per trajectory, averaged over each setting [E], in nats.
 
     ``run`` selects one of the solution's R rewards.

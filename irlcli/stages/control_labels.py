@@ -8,7 +8,7 @@ import msgspec
 from msgspec.structs import replace
 
 from irlcli.configs import CuedLabelsConfig
-from irlcli.controls.variants import Method
+from irlcli.controls.methods import LabelMethod
 from irlcli.errors import UsageError
 from irlcli.penalties import PENALTIES
 from irlcli.stages.base import Job, Request, Stage
@@ -23,27 +23,27 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the accuracies depend on."""
 
     problem: str
-    methods: tuple[Method, ...]
+    methods: tuple[LabelMethod, ...]
     labels: CuedLabelsConfig
 
 
-def methods(problem: str) -> tuple[Method, ...]:
+def methods(problem: str) -> tuple[LabelMethod, ...]:
     """ERM, every penalty of adversarial learners, and the controls.
 
     Every candidate for lambda on the digits, the largest one on the unit tests.
     """
     penalties = {n: p for n, p in PENALTIES.items() if "airl" in p.learners and n != "none"}
-    found = [Method()]
+    found = [LabelMethod()]
     for name, penalty in penalties.items():
         weights = penalty.candidates if problem == DIGITS else penalty.candidates[-1:]
-        found += [Method(penalty=name, weight=weight) for weight in weights]
+        found += [LabelMethod(penalty=name, weight=weight) for weight in weights]
     if problem != DIGITS:
-        return (*found, Method(oracle=True))
+        return (*found, LabelMethod(oracle=True))
     found += [
-        Method(penalty=name, weight=penalties[name].candidates[-1], shuffled=True)
+        LabelMethod(penalty=name, weight=penalties[name].candidates[-1], shuffled=True)
         for name in ("irmv1", "vrex", "iga")
     ]
-    return (*found, Method(dropout=0.5))
+    return (*found, LabelMethod(dropout=0.5))
 
 
 def request(problem: str, labels: CuedLabelsConfig) -> Request:
@@ -97,7 +97,7 @@ def run(job: Job) -> None:
         trained, unseen = cued_labels.unit_test(draw, seeds, c.unit_samples)
         invariant, hidden = cued_labels.permuted(trained.numpy(), seeds), 0
 
-    def rows_of(method: Method) -> list[dict[str, Any]]:
+    def rows_of(method: LabelMethod) -> list[dict[str, Any]]:
         networks = classifier.train(
             invariant if method.oracle else trained,
             method,

@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from irlcli.configs import CuedMapsConfig
-from irlcli.controls.variants import Variant
+from irlcli.controls.methods import MapMethod
 from irlcli.errors import UsageError
 from irlcli.penalties import PENALTIES
 from irlcli.stages.base import Job, Request, Stage
@@ -18,8 +18,8 @@ from irlcli.stages.running import run_parts
 _DEFAULT = CuedMapsConfig()
 
 
-_ERM, _BALANCED = Variant(grouping="pooled"), Variant(grouping="balanced")
-_ORACLE = Variant(grouping="pooled", sees="texture")
+_ERM, _BALANCED = MapMethod(grouping="pooled"), MapMethod(grouping="balanced")
+_ORACLE = MapMethod(grouping="pooled", sees="texture")
 _FEATURES = ("linear", "learned")
 
 
@@ -36,7 +36,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     strengths: tuple[float, ...]
-    variants: tuple[Variant, ...]
+    variants: tuple[MapMethod, ...]
     colours: int = 1
     features: str = "linear"
     leave_out: bool = False
@@ -105,29 +105,29 @@ def _weights(maps: CuedMapsConfig) -> tuple[float, ...]:
     return tuple(sorted(maps.penalty_weights))
 
 
-def _strongest(maps: CuedMapsConfig, penalty: str) -> Variant:
+def _strongest(maps: CuedMapsConfig, penalty: str) -> MapMethod:
     """``penalty`` at the largest lambda."""
-    return Variant(penalty=penalty, penalty_weight=_weights(maps)[-1])
+    return MapMethod(penalty=penalty, penalty_weight=_weights(maps)[-1])
 
 
-def _few(maps: CuedMapsConfig) -> tuple[Variant, ...]:
+def _few(maps: CuedMapsConfig) -> tuple[MapMethod, ...]:
     """ERM, the oracle and the two best penalties."""
     return (_ERM, _ORACLE, _strongest(maps, "irmv1-full"), _strongest(maps, "vrex"))
 
 
 def _sweeps(maps: CuedMapsConfig) -> Iterator[Case]:
     """Every penalty over its lambdas, with true and with shuffled labels."""
-    swept: dict[str, tuple[Variant, ...]] = {
+    swept: dict[str, tuple[MapMethod, ...]] = {
         "erm": (
             *(_ERM, _BALANCED, _ORACLE),
-            *(Variant(grouping="pooled", l2=l2) for l2 in maps.l2s),
+            *(MapMethod(grouping="pooled", l2=l2) for l2 in maps.l2s),
         )
     }
     for penalty in ("irmv1", "irmv1-full", "closed-form", "vrex", "group-dro"):
         weights = _weights(maps)
         if penalty == "group-dro":
             weights = PENALTIES[penalty].candidates
-        true = tuple(Variant(penalty=penalty, penalty_weight=w) for w in weights)
+        true = tuple(MapMethod(penalty=penalty, penalty_weight=w) for w in weights)
         shuffled = tuple(replace(v, grouping="shuffled") for v in true)
         swept[penalty] = (*true, *(shuffled if penalty == "irmv1-full" else shuffled[-1:]))
     swept["irmv1-full"] += (replace(_strongest(maps, "irmv1-full"), warm=False),)
@@ -145,7 +145,7 @@ def _without_warmup(maps: CuedMapsConfig) -> Iterator[Case]:
     """The smallest and the largest lambda from the start."""
     weights = _weights(maps)
     cold = tuple(
-        Variant(penalty=penalty, penalty_weight=weight, warm=False)
+        MapMethod(penalty=penalty, penalty_weight=weight, warm=False)
         for penalty in ("irmv1", "vrex")
         for weight in sorted({weights[0], weights[-1]})
     )
@@ -184,7 +184,7 @@ def _gaps(maps: CuedMapsConfig) -> Iterator[Case]:
 
 def _choices(maps: CuedMapsConfig) -> Iterator[Case]:
     """lambda chosen by leaving each setting out in turn."""
-    offered = tuple(Variant(penalty="irmv1-full", penalty_weight=w) for w in _weights(maps))
+    offered = tuple(MapMethod(penalty="irmv1-full", penalty_weight=w) for w in _weights(maps))
     for number, strengths in enumerate(maps.choices):
         yield Case(
             name=f"choice.{number + 1}",

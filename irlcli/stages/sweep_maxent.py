@@ -19,7 +19,7 @@ from irlcli.stages.train_maxent import indexed, judge, read_gridworld, side_by_s
 if TYPE_CHECKING:
     import numpy as np
 
-    from irlcli.learners.occupancy import Demonstrations
+    from irlcli.learners.occupancy import IndexedDemonstrations
     from irlcli.tabular import StackedMDPs
 
 # The penalties that Figure 2 compares; the paper's L2 weight of ERM and its lambdas of IRM.
@@ -181,7 +181,7 @@ def run(job: Job) -> None:
 def _fit(
     job: Job,
     settings: StackedMDPs,
-    demos: Mapping[int, Demonstrations],
+    demos: Mapping[int, IndexedDemonstrations],
     runs: Sequence[tuple[SweepVariant, int]],
     rewards: Sequence[np.ndarray],
     state: Any,

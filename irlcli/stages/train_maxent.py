@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from irlcli.learners.maxent import MaxEnt
-    from irlcli.learners.occupancy import Demonstrations
+    from irlcli.learners.occupancy import IndexedDemonstrations
     from irlcli.tabular import StackedMDPs
     from irlcli.trajectories import Trajectory
 
@@ -167,7 +167,7 @@ def read_gridworld(
 
 def indexed(
     settings: StackedMDPs, episodes: Sequence[Sequence[Trajectory]], grid: GridworldConfig
-) -> Demonstrations:
+) -> IndexedDemonstrations:
     """The episodes of each setting as state and action indices.
 
     Raises:
@@ -186,7 +186,7 @@ def indexed(
 def side_by_side(
     settings: StackedMDPs,
     grid: GridworldConfig,
-    runs: Sequence[tuple[MaxEntConfig, Demonstrations, int]],
+    runs: Sequence[tuple[MaxEntConfig, IndexedDemonstrations, int]],
 ) -> MaxEnt:
     """The learner of a reward for each of ``runs`` (config, demonstrations, seed).
 

@@ -6,7 +6,7 @@ import torch
 
 from irlcli.controls.classifier import Networks, Schedule, accuracy, train
 from irlcli.controls.cued_labels import UNIT_TESTS, coloured_digits, permuted, unit_test
-from irlcli.controls.variants import Method
+from irlcli.controls.methods import LabelMethod
 from irlcli.penalties import PENALTIES
 
 SEEDS = range(10)
@@ -36,18 +36,18 @@ def test_the_shares_are_exact():
 @pytest.mark.parametrize("name", ["irmv1", "vrex", "iga"])
 def test_an_invariance_penalty_ends_at_the_invariant_optimum(name):
     """0.75, the share of the labels that the digit tells (Arjovsky et al. 2019, Sec. 5.2)."""
-    assert torch.allclose(unseen(Method(name, 1e4)), torch.tensor(0.75))
+    assert torch.allclose(unseen(LabelMethod(name, 1e4)), torch.tensor(0.75))
 
 
 @pytest.mark.parametrize(
     "method",
     [
-        Method(),
-        Method("l2", 1e-2),
-        Method("input-gradient", 0.1),
-        Method("group-dro", 100.0),
-        Method(dropout=0.5),
-        Method("vrex", 1.0, shuffled=True),
+        LabelMethod(),
+        LabelMethod("l2", 1e-2),
+        LabelMethod("input-gradient", 0.1),
+        LabelMethod("group-dro", 100.0),
+        LabelMethod(dropout=0.5),
+        LabelMethod("vrex", 1.0, shuffled=True),
     ],
     ids=str,
 )
@@ -57,16 +57,16 @@ def test_what_seeks_no_invariance_fails_where_the_colour_turns(method):
 
 def test_shuffled_labels_do_not_find_the_digit():
     """With few samples shuffled groups still differ by chance, so some runs move."""
-    assert unseen(Method("irmv1", 1e4, shuffled=True)).mean() < 0.5
+    assert unseen(LabelMethod("irmv1", 1e4, shuffled=True)).mean() < 0.5
 
 
 @pytest.mark.parametrize("name", [n for n, p in PENALTIES.items() if "airl" in p.learners])
 def test_runs_do_not_affect_each_other(name):
     samples, seeds = drawn((0.9, 0.8), [3, 4]), [3, 4]
     short = Schedule(12, 2, 1e-2)
-    both = train(samples, Method(name, 2.0), short, 4, seeds)
+    both = train(samples, LabelMethod(name, 2.0), short, 4, seeds)
     for r, seed in enumerate(seeds):
-        alone = train(samples[r : r + 1], Method(name, 2.0), short, 4, [seed])
+        alone = train(samples[r : r + 1], LabelMethod(name, 2.0), short, 4, [seed])
         for one, other in zip(both.layers, alone.layers, strict=True):
             assert torch.allclose(one[r], other[0], atol=1e-5)
 
@@ -75,7 +75,7 @@ def test_a_penalty_of_the_parameters_that_is_not_registered_as_additive_fails(mo
     """Without its parameters it would be zero, and the control would report that it has no effect."""
     monkeypatch.setitem(PENALTIES, "l2", PENALTIES["l2"]._replace(additive=False))
     with pytest.raises(TypeError):
-        train(drawn((0.9,), [0]), Method("l2", 2.0), Schedule(4, 2, 1e-2), 0, [0])
+        train(drawn((0.9,), [0]), LabelMethod("l2", 2.0), Schedule(4, 2, 1e-2), 0, [0])
 
 
 def test_ties_count_half():
@@ -90,7 +90,7 @@ def test_the_oracle_passes_a_unit_test_that_erm_fails(name):
     trained, held_out = unit_test(UNIT_TESTS[name], SEEDS, 200)
     found = []
     for samples in (trained, permuted(trained.numpy(), SEEDS)):
-        networks = train(samples, Method(), Schedule(500, 0, 1e-2), 0, SEEDS)
+        networks = train(samples, LabelMethod(), Schedule(500, 0, 1e-2), 0, SEEDS)
         found.append(accuracy(networks, held_out).mean().item())
     erm, oracle = found
     assert erm < 0.62 and oracle > 0.9

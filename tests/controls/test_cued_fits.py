@@ -14,7 +14,7 @@ from irlcli.controls.cued_fits import (
     without,
 )
 from irlcli.controls.cued_maps import draw, features, hint_weights, torus
-from irlcli.controls.variants import Variant
+from irlcli.controls.methods import MapMethod
 from irlcli.learners.maxent import MaxEnt, Risks
 from irlcli.learners.soft_values import solve
 
@@ -77,11 +77,11 @@ def test_irm_wins_and_neither_its_control_nor_l2_do(data, hidden):
     erm, decayed, shuffled, irm, texture = quality(
         data,
         [
-            Variant("pooled"),
-            Variant("pooled", l2=0.1),
-            Variant("shuffled", "irmv1-full", 1e4),
-            Variant("per-setting", "irmv1-full", 1e4),
-            Variant("pooled", sees="texture"),
+            MapMethod("pooled"),
+            MapMethod("pooled", l2=0.1),
+            MapMethod("shuffled", "irmv1-full", 1e4),
+            MapMethod("per-setting", "irmv1-full", 1e4),
+            MapMethod("pooled", sees="texture"),
         ],
         hidden,
     )
@@ -93,14 +93,14 @@ def test_without_a_gap_between_the_settings_nothing_helps():
     data = dataset(CONFIG, strengths(0.875, 0.875), SEEDS)
     irm, vrex = quality(
         data,
-        [Variant("per-setting", "irmv1-full", 1e2), Variant("per-setting", "vrex", 1e2)],
+        [MapMethod("per-setting", "irmv1-full", 1e2), MapMethod("per-setting", "vrex", 1e2)],
     )
     assert max(irm, vrex) < 0.47
 
 
 def test_erm_pays_for_the_colour_and_the_texture_alone_does_not(data):
     fitted = fit(
-        CONFIG, data, [Variant("pooled"), Variant("pooled", sees="texture")], LINEAR, SEEDS
+        CONFIG, data, [MapMethod("pooled"), MapMethod("pooled", sees="texture")], LINEAR, SEEDS
     )
     (erm, texture) = hint_weights(fitted.reward)
     assert (erm[:, 1] > erm[:, 0]).all() and (erm > 0.0).all()
@@ -108,7 +108,7 @@ def test_erm_pays_for_the_colour_and_the_texture_alone_does_not(data):
 
 
 def test_the_risk_of_a_setting_is_its_negative_log_likelihood(data):
-    fitted = fit(replace(CONFIG, iterations=120), data, [Variant("pooled")], LINEAR, SEEDS)
+    fitted = fit(replace(CONFIG, iterations=120), data, [MapMethod("pooled")], LINEAR, SEEDS)
     each = [held_out_risk(CONFIG, data, e, fitted) for e in (0, 1)]
     # The record is made before the last update.
     assert np.allclose(np.mean(each, axis=0), -fitted.log_likelihood, rtol=1e-3)
@@ -117,7 +117,7 @@ def test_the_risk_of_a_setting_is_its_negative_log_likelihood(data):
 def test_group_dro_nears_the_smallest_worst_risk_as_lambda_grows(data):
     """Its loss does not grow with lambda, so a large one must not make the steps small."""
     weights = (0.0, 10.0, 100.0)
-    chosen = [Variant("per-setting", "group-dro", weight) for weight in weights]
+    chosen = [MapMethod("per-setting", "group-dro", weight) for weight in weights]
     fitted = fit(CONFIG, data, chosen, LINEAR, SEEDS)
     risks = np.stack([held_out_risk(CONFIG, data, e, fitted) for e in (0, 1)])
     worst = risks.max(axis=0).mean(axis=-1)
@@ -132,7 +132,7 @@ def test_a_setting_that_is_left_out_is_gone(data):
 
 def test_the_penalty_before_is_that_at_the_end_of_the_warm_up(data):
     """A fit that ends there has it as its last one."""
-    variant = [Variant("per-setting", "irmv1-full", 1e4, warm=True)]
+    variant = [MapMethod("per-setting", "irmv1-full", 1e4, warm=True)]
     short, whole = (
         fit(replace(CONFIG, iterations=n), data, variant, LINEAR, SEEDS)
         for n in (CONFIG.warmup + 1, CONFIG.iterations)
@@ -142,7 +142,11 @@ def test_the_penalty_before_is_that_at_the_end_of_the_warm_up(data):
 
 
 def test_variants_come_back_in_the_order_that_they_were_asked_for(data):
-    wanted = [Variant("pooled"), Variant("per-setting", "vrex", 10.0), Variant("pooled", l2=5.0)]
+    wanted = [
+        MapMethod("pooled"),
+        MapMethod("per-setting", "vrex", 10.0),
+        MapMethod("pooled", l2=5.0),
+    ]
     short = replace(CONFIG, iterations=110)
     together = fit(short, data, wanted, LINEAR, SEEDS).reward
     for k, variant in enumerate(wanted):

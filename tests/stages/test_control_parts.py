@@ -11,7 +11,7 @@ from irlcli.configs import load_config
 from irlcli.controls import cued_fits
 from irlcli.controls.classifier import Schedule, accuracy, train
 from irlcli.controls.cued_labels import UNIT_TESTS, permuted, unit_test
-from irlcli.controls.variants import Method
+from irlcli.controls.methods import LabelMethod
 from irlcli.experiments.runner import Runner
 from irlcli.stages import control, control_labels, control_maps
 from irlcli.stages.base import Job
@@ -174,7 +174,7 @@ def test_the_oracle_learns_from_inputs_that_tell_nothing_false(store):
     trained, unseen = unit_test(UNIT_TESTS["example 2"], seeds, labels.unit_samples)
     schedule = Schedule(labels.unit_steps, labels.unit_steps // 4, labels.learning_rate)
     oracle = permuted(trained.numpy(), seeds)
-    networks = train(oracle, Method(oracle=True), schedule, 0, seeds)
+    networks = train(oracle, LabelMethod(oracle=True), schedule, 0, seeds)
     made = Runner(store).run(control_labels.request("example 2", labels))
     rows = pq.read_table(made.directory / "accuracy.parquet").to_pylist()
     for name, samples in (("trained", trained), ("unseen", unseen)):

@@ -5,7 +5,7 @@ import msgspec
 _NAMES = {"pooled": "erm", "balanced": "erm-balanced"}
 
 
-class Variant(msgspec.Struct, frozen=True):
+class MapMethod(msgspec.Struct, frozen=True):
     """A method on cued maps. The first four fields are those of :class:`irlcli.configs.MaxEntConfig`.
 
     Attributes:
@@ -29,7 +29,7 @@ class Variant(msgspec.Struct, frozen=True):
         return text + (", sees the texture only" if self.sees == "texture" else "")
 
 
-class Method(msgspec.Struct, frozen=True):
+class LabelMethod(msgspec.Struct, frozen=True):
     """What a classifier adds to the mean risk of the settings.
 
     Attributes:
