@@ -48,18 +48,41 @@ def closure(needs):
     return {name: above(name) for name in needs}
 
 
-def test_each_job_waits_for_what_it_needs_and_is_submitted_once(tmp_path):
-    tables = tmp_path / "tables.toml"
-    tables.write_text(TABLES.replace("[0]", "[0, 1, 2]"))
+@pytest.fixture
+def session(tmp_path):
     line = {"profile": "smoke", "file": None, "overrides": [], "sources": [], "command": ["irl"]}
     session = StageSession(tmp_path / "runs", Silent(), **line)
     session.store.create()
-    plan = open_plan(session, TableChoice("tiny", tag="smoke", file=tables))
-    queue, command = Told(), JobCommand(lambda name: ["true"], Path.cwd(), 0, 1)
+    return session
 
-    def submit():
-        return Submission(plan, session.runner(), queue, command, Unseen()).submit()
 
-    assert submit() == len(plan.tasks) == len(queue.jobs)
+def planned(session, tmp_path, seeds="[0]"):
+    tables = tmp_path / "tables.toml"
+    tables.write_text(TABLES.replace("[0]", seeds))
+    return open_plan(session, TableChoice("tiny", tag="smoke", file=tables))
+
+
+def submit(session, plan, queue):
+    command = JobCommand(lambda name: ["true"], Path.cwd(), 0, 1)
+    return Submission(plan, session.runner(), queue, command, Unseen()).submit()
+
+
+def test_each_job_waits_for_what_it_needs_and_is_submitted_once(session, tmp_path):
+    plan, queue = planned(session, tmp_path, "[0, 1, 2]"), Told()
+    assert submit(session, plan, queue) == len(plan.tasks) == len(queue.jobs)
     assert closure(dict(queue.jobs.values())) == closure(plan.needs)
-    assert submit() == 0
+    assert submit(session, plan, queue) == 0
+
+
+def test_what_others_make_while_the_probe_waits_is_not_submitted(session, tmp_path):
+    plan = planned(session, tmp_path)
+    name = next(name for name in plan.tasks if name.endswith(".random-returns"))
+
+    class Slow(Told):
+        def probe(self, store, console):
+            session.runner().run(plan.tasks[name].request)
+
+    queue = Slow()
+    assert submit(session, plan, queue) == len(plan.tasks) - 1
+    assert name not in dict(queue.jobs.values())
+    assert name in session.store.names()

@@ -70,7 +70,7 @@ class Submission:
         self._alive: set[str] = set()
         self._running: dict[str, float] = {}
         self._gone: dict[str, float] = {}
-        self._started = 0.0
+        self._started = time.monotonic()
         self._lost: set[str] = set()
         self._explained: set[str] = set()
         self._signals = 0
@@ -93,12 +93,13 @@ class Submission:
             console.warn(f"waiting for {holder}, which submits jobs for this store")
 
         with store.working_on(LOCK, wait=True, on_wait=wait_for):
+            if self._find_queued(missing):
+                self._queue.probe(store, console)
+                # The probe may have waited for hours.
+                missing = self._still_missing(missing)
             new = self._find_queued(missing)
             if not new:
                 return 0
-            self._queue.probe(store, console)
-            # The probe may have waited for hours.
-            new = self._find_queued(missing)
             absent = set(missing)
             needs = {name: [n for n in self._plan.needs[name] if n in absent] for name in new}
             self._arrays = job_arrays(needs)
@@ -197,6 +198,14 @@ class Submission:
         if self._outcome.copied and any(map(self._plan.chooses, self._plan.tasks)):
             # A copied step may choose a lambda. What other runs made meanwhile is seen as well.
             self._plan.refresh()
+
+    def _still_missing(self, names: Sequence[str]) -> list[str]:
+        """``names`` without what jobs of other runs have made meanwhile, which is named."""
+        self._plan.lookup.forget_missing()
+        made = [name for name in names if self._exists(name)]
+        for name in made:
+            self._ended(name, last=False)
+        return [name for name in names if name not in made]
 
     def _exists(self, name: str) -> bool:
         return self._plan.step(name).status == "HIT"
