@@ -327,8 +327,8 @@ class Assessment(Struct, frozen=True, kw_only=True):
 class HintContrast(Struct, frozen=True, kw_only=True):
     """How a reward depends on each hint of :mod:`irlcli.envs.cue` in one setting.
 
-    the difference between g with the hint at 1 and g with the hint at -1, in standard deviations of g, mean over
-    ``steps``.
+    Each is the difference between g with the hint at 1 and g with the hint at -1, in standard
+    deviations of g, mean over ``steps``.
     """
 
     setting: str
@@ -347,6 +347,24 @@ class CueContrast(Struct, frozen=True, kw_only=True):
     reward: RewardOrigin
     scale: Positive
     settings: Annotated[tuple[HintContrast, ...], Meta(min_length=1)]
+
+
+class PenaltyChoice(Struct, frozen=True, kw_only=True):
+    """``choice.json``: the mean true return in each left-out setting, and the weight chosen.
+
+    ``scores`` has one dict per weight, from the left-out setting to the true return. ``ties`` is
+    the number of weights with the best mean; the smallest of them is chosen.
+    """
+
+    env: str
+    weights: tuple[float, ...]
+    scores: tuple[dict[str, float], ...]
+    chosen: float
+    ties: int
+
+    def __post_init__(self) -> None:
+        if len(self.scores) != len(self.weights):
+            raise ValueError("it has not one dict of scores for each weight")
 
 
 class SettingSummary(Struct, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@ Nothing is computed here.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import msgspec
 
@@ -14,6 +15,7 @@ from irlcli.experiments import facts
 from irlcli.experiments.inputs import source_in
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import made_by
+from irlcli.experiments.tables import Row as TableRow
 from irlcli.interventions import listed_settings, without_cue
 from irlcli.report.parameters import ASSESS, CUE, Cell, Row, Run
 from irlcli.stages import report, report_experts
@@ -30,6 +32,10 @@ def request(plan: Plan, command: str) -> Request:
     if plan.figure is not None:
         return plan.figure
     cells, sources = _cells(plan)
+    made = _choices(plan)
+    sources |= {
+        report.choice_role(*run): source_in(one, "choice.json") for run, one in made.items()
+    }
     if not any(cell.run for cell in cells):
         raise NotFound(
             f"{plan.lookup.store.root} holds no evaluation of {plan.table.name} with this config"
@@ -47,7 +53,7 @@ def request(plan: Plan, command: str) -> Request:
         title=plan.table.title,
         command=command,
         measures=tuple(m for m in plan.table.measures if m not in (ASSESS, CUE)),
-        rows=tuple(_rows(plan)),
+        rows=tuple(_rows(plan, made)),
         methods=plan.table.compared,
         variants=plan.table.variants,
         learned_by=plan.table.methods[0] if plan.table.variants else "",
@@ -138,7 +144,7 @@ def _artefacts(plan: Plan) -> dict[str, Artefact]:
     return {artefact.id: artefact for artefact in held if artefact is not None}
 
 
-def _rows(plan: Plan) -> list[Row]:
+def _rows(plan: Plan, choices: Mapping[tuple[str, str, int], Artefact]) -> list[Row]:
     rows = []
     for row in plan.table.rows:
         config = plan.config(row.env)
@@ -162,22 +168,38 @@ def _rows(plan: Plan) -> list[Row]:
                 unseen=str(unseen[0]),
                 demonstrations=demos.parameters.episodes,
                 config=msgspec.to_builtins(configs),
-                chosen=_chosen(plan, str(row)),
+                chosen=_weights(plan, row, choices),
             )
         )
     return rows
 
 
-def _chosen(plan: Plan, row: str) -> dict[str, float]:
+def _choices(plan: Plan) -> dict[tuple[str, str, int], Artefact]:
+    """The choices of a lambda that the store holds, by row, method and seed."""
+    found = {}
+    for row, method, seed in product(plan.table.rows, plan.table.methods, plan.table.seeds):
+        reward = _reward(plan, row, method, seed)
+        if reward is not None and "penalty choice" in reward.inputs:
+            choice = _held(plan, made_by(reward.inputs["penalty choice"]))
+            if choice is not None:
+                found[f"{row.env} {row.knob}", method, seed] = choice
+    return found
+
+
+def _weights(
+    plan: Plan, row: TableRow, choices: Mapping[tuple[str, str, int], Artefact]
+) -> dict[str, float]:
     """Each lambda of the table's own, by method, and each chosen one, by ``METHOD SEED``."""
     listed = {} if plan.selection.candidates else plan.table.penalty_weights
     found = {method: weight for method, weight in listed.items() if method in plan.table.methods}
-    for method in plan.table.methods:
-        for seed in plan.table.seeds:
-            task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")
-            if task is None or "penalty choice" not in task.request.inputs:
-                continue
-            choice = made_by(task.request.inputs["penalty choice"])
-            if _held(plan, choice) is not None:
-                found[f"{method} {seed}"] = task.request.parameters.airl.penalty_weight
+    for name, method, seed in choices:
+        reward = _reward(plan, row, method, seed)
+        if name == f"{row.env} {row.knob}" and reward is not None:
+            found[f"{method} {seed}"] = reward.parameters.airl.penalty_weight
     return found
+
+
+def _reward(plan: Plan, row: TableRow, method: str, seed: int) -> Request | None:
+    """What learns the reward of ``method`` and ``seed``, if the plan has it."""
+    task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")
+    return None if task is None else task.request

@@ -108,7 +108,7 @@ class Chosen(NamedTuple):
         if file_digest(path) != made.output("choice.json").sha256:
             # What needs it reports the damage when it reads the file.
             return None
-        return descriptions.convert(read_json(path), choose_penalty.Choice, path).chosen
+        return descriptions.convert(read_json(path), descriptions.PenaltyChoice, path).chosen
 
 
 class _RowRequests:

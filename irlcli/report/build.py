@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from irlcli.report import ablation, caveats, compute, cue, result_tables, retrained
+from irlcli.report.choices import Choices, choice_table, choices
 from irlcli.report.in_short import in_short
 from irlcli.report.parameters import Parameters
 from irlcli.report.tables import Table
@@ -30,6 +31,7 @@ class Report:
             :func:`irlcli.report.ablation.summarise_variants`; empty without variants.
         reward_quality: see :func:`irlcli.report.compute.reward_quality`.
         cue_contrasts: see :func:`irlcli.report.cue.cue_contrasts`.
+        choices: see :func:`irlcli.report.choices.choices`.
         in_short: see :func:`irlcli.report.in_short.in_short`.
         tables: the same for people.
         caveats: what a reader must know before drawing conclusions.
@@ -44,6 +46,7 @@ class Report:
     discriminators: pd.DataFrame
     reward_quality: pd.DataFrame
     cue_contrasts: pd.DataFrame
+    choices: pd.DataFrame
     shares: pd.DataFrame
     variants: pd.DataFrame
     in_short: list[str]
@@ -58,6 +61,7 @@ def build(
     learning: compute.Learning,
     assessments: compute.Assessments = MappingProxyType({}),
     contrasts: cue.CueContrasts = MappingProxyType({}),
+    weights_chosen: Choices = MappingProxyType({}),
 ) -> Report:
     """The report on ``points``.
 
@@ -68,6 +72,7 @@ def build(
         learning: the metrics of ``train-airl`` by (row, method, seed).
         assessments: of the rewards, by (row, method, seed).
         contrasts: how the rewards depend on a cue, by (row, method, seed).
+        weights_chosen: how lambda was chosen, by (row, method, seed).
     """
     cells = compute.summarise_cells(p, points)
     comparisons = compute.compare_methods(p, points, cells)
@@ -77,6 +82,7 @@ def build(
     discriminators = compute.discriminator_ends(p, learning)
     reward_quality = compute.reward_quality(p, assessments)
     cue_contrasts = cue.cue_contrasts(p, contrasts)
+    chosen = choices(p, weights_chosen)
     shares = ablation.shares(p, points) if p.variants else pd.DataFrame()
     variants = ablation.summarise_variants(p, shares) if p.variants else pd.DataFrame()
     tables = [
@@ -89,6 +95,7 @@ def build(
         result_tables.reward_quality(reward_quality),
         result_tables.comparisons(p, comparisons),
         result_tables.discriminators(discriminators),
+        choice_table(chosen),
         result_tables.cells(cells),
         result_tables.budgets(p),
         result_tables.costs(p),
@@ -118,6 +125,7 @@ def build(
         discriminators=discriminators,
         reward_quality=reward_quality,
         cue_contrasts=cue_contrasts,
+        choices=chosen,
         shares=shares,
         variants=variants,
         in_short=in_short(p, cells, comparisons),

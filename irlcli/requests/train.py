@@ -90,7 +90,7 @@ def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | N
     if prepared is None:
         return None
     made, path = prepared
-    found = descriptions.convert(read_json(path), choice.Choice, path)
+    found = descriptions.convert(read_json(path), descriptions.PenaltyChoice, path)
     tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
     tried = ",".join(f"{weight:g}" for weight in found.weights)
     session.console.say(f"lambda {found.chosen:g} was the best of {tried}{tied} ({path})")

@@ -22,20 +22,6 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
 
 
-class Choice(msgspec.Struct, frozen=True, kw_only=True):
-    """``choice.json``: the mean true return in each left-out setting, and the weight chosen.
-
-    ``scores`` has one dict per weight, from the left-out setting to the true return. ``ties`` is
-    the number of weights with the best mean; the smallest of them is chosen.
-    """
-
-    env: str
-    weights: tuple[float, ...]
-    scores: tuple[dict[str, float], ...]
-    chosen: float
-    ties: int
-
-
 def request(
     demos: Source | From,
     env: str,
@@ -131,7 +117,7 @@ def run(job: Job) -> None:
             row[text] = summary.settings[0].mean_return
         scores.append(row)
     means = [sum(row.values()) / len(row) for row in scores]
-    choice = Choice(
+    choice = descriptions.PenaltyChoice(
         env=p.environment.name,
         weights=p.weights,
         scores=tuple(scores),

@@ -25,12 +25,18 @@ if TYPE_CHECKING:
 def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
     """The report on ``sources``: evaluations by :attr:`Cell.role`, and ``metrics.parquet`` files.
 
-    The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. Outputs
+    The latter are ``ROW METHOD SEED reward-learning`` and ``... transfer-learning``. A chosen lambda
+    has its ``choice.json``, by :func:`choice_role`. Outputs
     ``README.md``, ``KIND.csv`` (a row per cell), ``seeds.csv`` (a row per seed and setting),
     ``comparisons.csv``, with variants ``variants.csv`` and ``shares.csv``, ``KIND.json``, ``.tex``,
     ``.html``, ``.png`` and ``.pdf``; for each row with an assessed reward ``bank-ENV-KNOB.png``.
     """
     return Request(STAGE, parameters, dict(sources), f"report {parameters.kind}")
+
+
+def choice_role(row: str, method: str, seed: int) -> str:
+    """The role of the ``choice.json`` by which the lambda of a method and seed was chosen."""
+    return f"{row} {method} {seed} penalty-choice"
 
 
 def run(job: Job) -> None:
@@ -55,8 +61,17 @@ def run(job: Job) -> None:
     }
     assessments = _of_rewards(job, ASSESS, "assessment.json", descriptions.Assessment)
     contrasts = _of_rewards(job, CUE, "cue.json", descriptions.CueContrast)
+    choices = {
+        (row.name, method, seed): descriptions.convert(
+            read_json(job.inputs[role]), descriptions.PenaltyChoice, job.inputs[role]
+        )
+        for row in p.rows
+        for method in p.methods
+        for seed in p.seeds
+        if (role := choice_role(row.name, method, seed)) in job.inputs
+    }
     points = pd.DataFrame(_points(job))
-    report = build.build(p, points, _episodes(job), rewards, assessments, contrasts)
+    report = build.build(p, points, _episodes(job), rewards, assessments, contrasts, choices)
     _write(job, report, assessments, learning)
 
 

@@ -338,6 +338,16 @@ def test_a_lambda_that_was_chosen_is_followed(report, irl, table_store, tmp_path
     (budgets,) = (t for t in said["tables"] if t["title"] == "Budgets")
     weight = json.loads((copy / made.out.strip().split("/")[-1] / "reward.json").read_text())
     assert budgets["rows"][1][4].endswith(f"irm 0: {weight['airl']['penalty_weight']:g}")
+    # Each candidate's students in each setting left out, and the candidate with the best mean.
+    scores = pd.DataFrame(said["choices"])
+    assert set(zip(scores["penalty_weight"], scores["left_out"], strict=True)) == {
+        (w, s) for w in (1.0, 10.0) for s in ("engine-power=1x", "engine-power=1.25x")
+    }
+    means = scores.groupby("penalty_weight")["true_return"].mean()
+    assert set(scores[scores["chosen"]]["penalty_weight"]) == {means.idxmax()}
+    assert means.idxmax() == weight["airl"]["penalty_weight"]
+    (choices,) = (t for t in said["tables"] if t["title"] == "Choice of lambda")
+    assert [line[3] for line in choices["rows"]] == ["1", "10"]
     # Without asking for it, the fixed lambda's runs are what the table is made of.
     fixed = json.loads(report("table1", copy, *ROW, "--json").out)["report"]
     assert sum(p["agent"] == "irm" and p["measure"] == "zero-shot" for p in fixed["points"]) == 2
