@@ -24,7 +24,8 @@ def assess(
     intervention: Annotated[
         str | None,
         typer.Option(
-            help="Settings: KNOB=VALUE,..., or KNOB (training values). Default: those in which the reward was learned."
+            help="Settings: KNOB=VALUE,..., or KNOB (training values). Default: those in which the "
+            "reward was learned."
         ),
     ] = None,
     setting: OneSetting = [],  # noqa: B006

@@ -26,7 +26,8 @@ def collect_experts(
         typer.Option(
             metavar="SETTING=EXPERT",
             help="Use this expert in SETTING instead of training one: policy.pt or its artefact; a .zip "
-            "of stable-baselines3; or MODEL.zip+STATISTICS.pkl if it was trained under VecNormalize. Repeatable.",
+            "of stable-baselines3; or MODEL.zip+STATISTICS.pkl if it was trained under VecNormalize. "
+            "Repeatable.",
         ),
     ] = [],  # noqa: B006
     trust: Annotated[

@@ -354,7 +354,7 @@ class AssessmentConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """How ``irl assess`` measures a reward.
 
     Attributes:
-        noise: the ladder on the clone: probabilities of a random action instead of its own.
+        noise: probabilities with which the clone takes a random action instead of its own.
     """
 
     noise: tuple[Fraction, ...] = (0.0, 0.1, 0.25, 0.5, 0.75)

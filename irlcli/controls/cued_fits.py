@@ -52,10 +52,10 @@ def without(data: Dataset, left_out: int) -> Dataset:
 
 
 class Fitted(NamedTuple):
-    """The rewards [V, S, T] of V variants, and their records, [V, S] each.
+    """The rewards [V, S, T] of V methods, and their records, [V, S] each.
 
     ``log_likelihood`` is the mean over the settings trained on [nats per episode].
-    ``penalty_before`` is the penalty after ``warmup`` iterations, also of a variant without a
+    ``penalty_before`` is the penalty after ``warmup`` iterations, also of a method without a
     warm-up, and ``penalty`` the last one.
     """
 
@@ -68,31 +68,31 @@ class Fitted(NamedTuple):
 def fit(
     config: CuedMapsConfig,
     data: Dataset,
-    variants: Sequence[MapMethod],
+    methods: Sequence[MapMethod],
     hidden: int,
     seeds: Sequence[int],
 ) -> Fitted:
-    """Fit every variant to every run's data; those that share a learner side by side.
+    """Fit every method to every run's data; those that share a learner side by side.
 
     ``hidden`` is the width of the learned reward, in place of ``config.hidden``; 0 for a linear one.
     """
     settings = torus(config.size, data.maps.kinds.shape[1])
     risks: dict[tuple[str, int], Risks] = {}
-    for grouping in {v.grouping for v in variants}:
+    for grouping in {m.grouping for m in methods}:
         for r, (demos, seed) in enumerate(zip(data.demos, seeds, strict=True)):
             risks[grouping, r] = group_risks(settings, demos, grouping, config.horizon, seed)
     inputs = features(data.colours)
     results: dict[MapMethod, tuple[np.ndarray, ...]] = {}
-    shared = dict.fromkeys((v.penalty, v.warm, v.sees) for v in variants)
+    shared = dict.fromkeys((m.penalty, m.warm, m.sees) for m in methods)
     for penalty, warm, sees in shared:
-        chosen = [v for v in variants if (v.penalty, v.warm, v.sees) == (penalty, warm, sees)]
-        runs = [(v, r) for v in chosen for r in range(len(seeds))]
+        chosen = [m for m in methods if (m.penalty, m.warm, m.sees) == (penalty, warm, sees)]
+        runs = [(m, r) for m in chosen for r in range(len(seeds))]
         learner = MaxEnt(
             settings,
             inputs * (np.arange(inputs.shape[1]) == 0) if sees == "texture" else inputs,
-            [risks[v.grouping, r] for v, r in runs],
-            np.array([v.penalty_weight for v, _ in runs]),
-            np.array([v.l2 for v, _ in runs]),
+            [risks[m.grouping, r] for m, r in runs],
+            np.array([m.penalty_weight for m, _ in runs]),
+            np.array([m.l2 for m, _ in runs]),
             [seeds[r] for _, r in runs],
             penalty=penalty,
             horizon=config.horizon,
@@ -106,7 +106,7 @@ def fit(
         found = (reward, last.log_likelihood.mean(-1), before.penalty, last.penalty)
         parts = zip(*(np.split(array, len(chosen)) for array in found), strict=True)
         results |= dict(zip(chosen, parts, strict=True))
-    return Fitted(*map(np.stack, zip(*(results[v] for v in variants), strict=True)))
+    return Fitted(*map(np.stack, zip(*(results[m] for m in methods), strict=True)))
 
 
 def unseen(

@@ -37,7 +37,7 @@ def coloured_digits(
 
 
 def cows_and_camels(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Example 2: the animal tells the label exactly, in inputs of a hundredth of the background's
+    """Example 2: the animal always agrees with the label, in inputs of a hundredth of the background's
     size. The background agrees in 95, 97 and 99 %.
 
     The labels are equally frequent here; Aubin et al. let 30, 50 and 70 % be cows.

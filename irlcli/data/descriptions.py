@@ -364,7 +364,9 @@ class PenaltyChoice(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if len(self.scores) != len(self.weights):
-            raise ValueError("it has not one dict of scores for each weight")
+            raise ValueError(f"it has scores for {len(self.scores)} of {len(self.weights)} weights")
+        if self.chosen not in self.weights:
+            raise ValueError(f"it chose {self.chosen:g}, which is no candidate")
 
 
 class SettingSummary(Struct, frozen=True, kw_only=True):

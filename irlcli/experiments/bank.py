@@ -42,7 +42,7 @@ class Policies(NamedTuple):
     """The policies of a bank besides the idle and the random agent.
 
     Attributes:
-        clone: of the demonstrations, for the ladder.
+        clone: of the demonstrations, for its noisy copies.
         student: trained together with the reward.
         reused: experts of other settings, by the setting each was trained in.
         experts: each setting's own, by setting.
@@ -131,7 +131,7 @@ class Finder:
             reward: a ``reward.pt``.
             origin: its description.
             settings: of the bank.
-            demos: demonstrations for the clone; None for no ladder.
+            demos: demonstrations for the clone; None for no clone.
             cloned: their settings that the clone imitates.
             seed: of the clone.
         """

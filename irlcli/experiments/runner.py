@@ -224,7 +224,8 @@ class Runner:
         if published.diverged is not None:
             self.console.warn(
                 f"{request.label} differs from {published.diverged.id}, the stored result of the same "
-                f"request, which commands continue to use; the new result is kept as {published.artefact.id}"
+                f"request, which commands continue to use; the new result is kept as "
+                f"{published.artefact.id}"
             )
         self.console.finish(request.label, published.artefact, hit=False)
         if checkpoints.stop_requested:

@@ -19,8 +19,8 @@ from irlcli.trajectories import Transitions
 CueContrasts = Mapping[tuple[str, str, int | None], CueContrast]
 
 _NOTE = (
-    "How the frozen reward depends on each hint alone: the difference between g with the hint at 1 and g with the hint at -1, "
-    "everything else as recorded, mean over the demonstrated steps, in standard deviations of g on the "
+    "How the frozen reward depends on each hint alone: the difference between g with the hint at 1 and "
+    "g with the hint at -1, everything else as recorded, mean over the demonstrated steps, in standard deviations of g on the "
     "training data; mean over the settings trained in, then over seeds with its 95 % bootstrap interval. "
     f"The texture is right in {TEXTURE:.0%} of the steps of every setting, the cue in a share that differs. "
     "sd of g: that deviation, mean over seeds (least to largest). If it is near zero, g hardly distinguishes the "

@@ -216,8 +216,10 @@ def _lineage(p: Parameters) -> str:
 
 def _tree(p: Parameters, id16: str, descendants: tuple[str, ...] = ()) -> list[str]:
     indent = "  " * len(descendants)
-    # In a crafted store a run may be made from itself.
-    if id16 not in p.runs or id16 in descendants:
+    if id16 in descendants:
+        # Only in a crafted store.
+        return [f"{indent}{id16}  made from itself"]
+    if id16 not in p.runs:
         return [f"{indent}{id16}  not a run of this report"]
     run = p.runs[id16]
     took = "" if run.seconds is None else f"  {duration(run.seconds)}"

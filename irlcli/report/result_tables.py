@@ -22,8 +22,8 @@ from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
     "Mean true return ± standard deviation over seeds. Training experts, reused: the mean over the "
-    "experts of the training settings, each evaluated in the settings in which the students are evaluated. This is the return "
-    "without learning a reward."
+    "experts of the training settings, each evaluated in the settings in which the students are "
+    "evaluated. This is the return without learning a reward."
 )
 _TEST_NOTE = (
     f"p: Welch's test, {title('irm')} against {title('erm')}; Holm: adjusted over the rows that have a "

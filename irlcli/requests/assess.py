@@ -62,8 +62,8 @@ def assess(
     policies = finder.policies(source, origin, settings, shown, cloned, seed)
     if shown is None:
         session.console.warn(
-            "the bank has no noisy clones: the store lacks the demonstrations that this reward was learned from; "
-            "name demonstrations with --demos"
+            "the bank has no noisy clones: the store lacks the demonstrations that this reward "
+            "was learned from; name them with --demos"
         )
     _warn_of_missing_experts(session, origin.env, settings, policies)
     request = stage.request(

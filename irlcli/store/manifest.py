@@ -244,7 +244,7 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
     """The provenance record of the artefact ``artefact_id`` in ``directory``.
 
     Raises:
-        IntegrityError: unreadable, altered, or written for another artefact.
+        IntegrityError: unreadable, altered, of another form, or written for another artefact.
     """
     path = directory / PROVENANCE
     data = _read(path)
@@ -259,12 +259,13 @@ def read_provenance(directory: Path, artefact_id: str) -> dict[str, Any]:
         raise IntegrityError(f"{path} was altered: its checksum does not match")
     if value["artefact"] != artefact_id:
         raise IntegrityError(f"{path} belongs to another artefact")
-    if not _is_provenance(value["record"]):
-        raise IntegrityError(f"{path} is malformed")
+    if wrong := _malformed(value["record"]):
+        raise IntegrityError(f"{path} is malformed: {wrong} has another form")
     return value["record"]
 
 
-# Of a provenance record, what the program reads. Each field may be absent, or null.
+# Of a provenance record, what many commands read; a described environment is checked where it is used. Each
+# field may be absent, or null.
 _FORMS: dict[str, type | tuple[type, ...]] = {
     "command": list,
     "git": dict,
@@ -276,16 +277,22 @@ _FORMS: dict[str, type | tuple[type, ...]] = {
 }
 
 
-def _is_provenance(record: Mapping[str, Any]) -> bool:
-    """Whether the fields of ``record`` are as a runner writes them."""
-    if not all(_is_of(record.get(name), kind) for name, kind in _FORMS.items()):
-        return False
-    texts = [*(record.get("command") or ()), *(record.get("inputs") or {}).values()]
-    states = [record.get("git") or {}, *(record.get("attempts") or ())]
-    return all(isinstance(text, str) for text in texts) and all(
-        isinstance(state, dict) and all(_is_of(state.get(n), str) for n in ("commit", "dirty"))
-        for state in states
-    )
+def _malformed(record: Mapping[str, Any]) -> str | None:
+    """The first field of ``record`` that is not as a runner writes it."""
+    for name, kind in _FORMS.items():
+        if not _is_of(record.get(name), kind):
+            return name
+    if not all(isinstance(word, str) for word in record.get("command") or ()):
+        return "command"
+    if not all(isinstance(place, str) for place in (record.get("inputs") or {}).values()):
+        return "inputs"
+    if not _is_code(record.get("git") or {}):
+        return "git"
+    return None if all(map(_is_code, record.get("attempts") or ())) else "attempts"
+
+
+def _is_code(state: Any) -> bool:
+    return isinstance(state, dict) and all(_is_of(state.get(n), str) for n in ("commit", "dirty"))
 
 
 def _is_of(value: Any, kind: type | tuple[type, ...]) -> bool:

@@ -19,7 +19,7 @@ def drawn(strengths, seeds=SEEDS):
 
 
 def unseen(method):
-    """Accuracy where the colour tells the opposite, for each of ten seeds."""
+    """Accuracy where the colour agrees with the opposite label, for each of ten seeds."""
     networks = train(drawn((0.9, 0.8)), method, SCHEDULE, 16, SEEDS)
     return accuracy(networks, drawn((0.1,)))[:, 0]
 
@@ -35,7 +35,7 @@ def test_the_shares_are_exact():
 
 @pytest.mark.parametrize("name", ["irmv1", "vrex", "iga"])
 def test_an_invariance_penalty_ends_at_the_invariant_optimum(name):
-    """0.75, the share of the labels that the digit tells (Arjovsky et al. 2019, Sec. 5.2)."""
+    """0.75, the share of the labels that the digit agrees with (Arjovsky et al. 2019, Sec. 5.2)."""
     assert torch.allclose(unseen(LabelMethod(name, 1e4)), torch.tensor(0.75))
 
 

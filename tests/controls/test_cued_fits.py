@@ -40,7 +40,7 @@ def strengths(*of_each_setting):
 
 @pytest.mark.parametrize("penalty", ["irmv1", "irmv1-full", "closed-form", "vrex"])
 def test_the_invariant_reward_has_no_penalty_and_is_a_fixed_point(penalty):
-    """A texture that always tells the quality: psi = value / 2 and 0 is the true reward."""
+    """A texture that always agrees with the quality: psi = value / 2 and 0 is the true reward."""
     maps = draw([0], 6, 1.0, np.array([[[0.95], [0.8]]]), purpose=0)
     settings = torus(6, 2)
     expert = solve(settings, 2.0 * maps.quality, 5).occupancy[0]

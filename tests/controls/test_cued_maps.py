@@ -10,13 +10,13 @@ STRENGTHS = np.broadcast_to(np.array([[0.95], [0.8]]), (3, 2, 1))
 
 
 def agreement(maps, bit, quality):
-    """Share of the cells of one quality whose cue tells it [R, E]."""
+    """Share of the cells of one quality whose cue agrees with it [R, E]."""
     shown = maps.kinds >> bit & 1
     group = maps.quality == quality
     return ((shown == maps.quality) & group).sum(-1) / group.sum(-1)
 
 
-def test_each_cue_tells_the_quality_in_its_share_of_good_and_of_bad_cells():
+def test_each_cue_agrees_with_the_quality_in_its_share_of_good_and_of_bad_cells():
     maps = draw([0, 1, 2], 20, 0.75, STRENGTHS, purpose=0)
     assert (maps.quality.mean(-1) == 0.5).all()
     for quality in (0.0, 1.0):
@@ -64,7 +64,7 @@ def test_a_reward_of_nothing_visits_all_cells_equally():
 
 
 def test_the_true_reward_differs_by_nothing():
-    """A texture that always tells the quality is the true reward."""
+    """A texture that always agrees with the quality is the true reward."""
     maps = draw([0, 1], 6, 1.0, STRENGTHS[:2], purpose=0)
     found = judge(torus(6, 2), maps, np.tile([0.0, 2.0], (2, 2)), 2.0, 5)
     assert np.allclose(found.value_difference, 0.0)

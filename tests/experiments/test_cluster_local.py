@@ -207,7 +207,7 @@ def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):
     "words, said",
     [
         (["--cluster", "slrum"], "did you mean 'slurm'?"),
-        (["--cluster", "local", "--detach"], "--detach"),
+        (["--cluster", "local", "--detach"], "--detach does not work with --cluster local"),
         (["--detach"], "--cluster slurm"),
         (["--partition", "long"], "--cluster slurm"),
         (["--sbatch", "account=mine"], "--cluster slurm"),

@@ -311,7 +311,7 @@ def test_a_provenance_of_another_form_is_named(irl, empty_store, origin):
         assert_refused((done.code, done.out, done.err), 4, "provenance.json")
 
 
-def test_an_evaluation_that_was_made_from_itself_is_reported(irl, empty_store, publish):
+def test_an_evaluation_that_was_made_from_itself_has_its_own_circumstances(empty_store, publish):
     files = {"summary.json": b"{}", "policy.pt": b"policy"}
     inputs = {"policy": hashlib.sha256(b"policy").hexdigest()}
     made = publish(empty_store, files, stage="evaluate", inputs=inputs).artefact

@@ -12,9 +12,10 @@ import torch
 from airl_runs import CONFIG, LANDER, SETTINGS, make, random_episodes
 
 from irlcli.data.demonstrations import read_demonstrations
+from irlcli.data.descriptions import PenaltyChoice, convert
 from irlcli.data.streaming import write_demonstrations
 from irlcli.data.tensors import load_policy_file, load_reward_file
-from irlcli.errors import StageFailed
+from irlcli.errors import IntegrityError, StageFailed
 from irlcli.experiments.runner import Silent
 from irlcli.learners.discriminator import full_weight_from, penalty_weight_at
 from irlcli.learners.selection import BestRound, hold_out, log_likelihood
@@ -231,6 +232,22 @@ def test_the_largest_mean_is_chosen(tmp_path, first, second, chosen, ties):
     choose_penalty.run(Job(parameters, inputs, tmp_path, None, Silent()))
     made = read_json(tmp_path / "choice.json")
     assert (made["chosen"], made["ties"]) == (chosen, ties)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"chosen": 3.0}, "3"),
+        ({"scores": [{FIRST: 1.0}]}, "1 of 2"),
+        ({"weights": "all"}, "weights"),
+    ],
+)
+def test_a_choice_of_another_form_is_refused(changes, named):
+    choice = {"env": LANDER, "weights": [0.1, 1.0], "scores": [{FIRST: 1.0}, {FIRST: 2.0}]}
+    choice |= {"chosen": 1.0, "ties": 1}
+    assert convert(choice, PenaltyChoice, "choice.json").chosen == 1.0
+    with pytest.raises(IntegrityError, match=rf"choice\.json.*{named}"):
+        convert(choice | changes, PenaltyChoice, "choice.json")
 
 
 def test_held_out_episodes_are_not_trained_on(store_copy, tmp_path, irl):

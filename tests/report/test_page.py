@@ -64,6 +64,14 @@ def test_the_page_is_well_formed_and_self_contained():
     assert "prefers-color-scheme: dark" in html and "@media print" in html
 
 
+def test_a_run_that_was_made_from_itself_ends_its_lineage():
+    p, points = example(complete())
+    crafted = p.cells[0].run
+    p = replace(p, runs=p.runs | {crafted: run_of(0, inputs=(crafted,))})
+    html = page.html(p, build(p, points, {}, {}), "<svg/>", {}, {})
+    assert f"{crafted}  made from itself" in "".join(parsed(html).text)
+
+
 def test_what_came_out_and_caveats_are_in_every_format():
     p, points = example(complete() | {(BOUNCE, "irm", "transfer"): [5.0, None, None]})
     report = build(p, points, {}, {})

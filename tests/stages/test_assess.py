@@ -252,7 +252,7 @@ def test_the_clone_can_be_evaluated_like_any_policy(assessed, irl):
     )
 
 
-def test_a_reward_without_its_store_has_a_ladder_only_with_demos(smoke_store, irl, tmp_path):
+def test_a_reward_without_its_store_has_noisy_clones_only_with_demos(smoke_store, irl, tmp_path):
     shutil.copy(smoke_store.path / smoke_store.airl / "reward.pt", tmp_path)
     store = tmp_path / "runs"
     line = ["assess", tmp_path / "reward.pt", "--intervention", "engine-power=1x", *SMOKE]
@@ -261,7 +261,7 @@ def test_a_reward_without_its_store_has_a_ladder_only_with_demos(smoke_store, ir
     assert "clone" not in alone.out and "record idle" in alone.out
     demos = smoke_store.path / smoke_store.demos
     given = irl(*line, "--store", store, "--demos", demos, "--dry-run")
-    assert "no ladder" not in given.err and given.out.count("BLOCKED record clone") == 5
+    assert "no noisy clones" not in given.err and given.out.count("BLOCKED record clone") == 5
 
 
 def test_an_expert_of_another_store_is_used(smoke_store, irl, tmp_path):

@@ -93,14 +93,15 @@ class Submission:
             console.warn(f"waiting for {holder}, which submits jobs for this store")
 
         with store.working_on(LOCK, wait=True, on_wait=wait_for):
-            if self._find_queued(missing):
-                self._queue.probe(store, console)
-                # The probe may have waited for hours.
-                missing = self._still_missing(missing)
-            new = self._find_queued(missing)
+            if not self._find_queued(missing):
+                return 0
+            self._queue.probe(store, console)
+            # The probe may have waited for hours. What is no longer in the queue may have been made.
+            gone = self._find_queued(missing)
+            new = self._still_missing(gone)
             if not new:
                 return 0
-            absent = set(missing)
+            absent = {*new, *self._ids}
             needs = {name: [n for n in self._plan.needs[name] if n in absent] for name in new}
             self._arrays = job_arrays(needs)
             self._record = new_record(store, self._queue.place)
