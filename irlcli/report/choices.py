@@ -33,7 +33,7 @@ def choices(p: Parameters, found: Choices) -> pd.DataFrame:
             "seed": seed,
             "penalty_weight": weight,
             "left_out": setting,
-            "true_return": score,
+            "true_return": scores[setting],
             "chosen": weight == choice.chosen,
         }
         for row in p.rows
@@ -41,7 +41,8 @@ def choices(p: Parameters, found: Choices) -> pd.DataFrame:
         for seed in p.seeds
         if (choice := found.get((row.name, method, seed))) is not None
         for weight, scores in zip(choice.weights, choice.scores, strict=True)
-        for setting, score in scores.items()
+        for setting in row.trained
+        if setting in scores
     ]
     names = ("row", "agent", "seed", "penalty_weight", "left_out", "true_return", "chosen")
     return pd.DataFrame(rows, columns=list(names))
