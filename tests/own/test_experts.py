@@ -187,7 +187,7 @@ def test_nothing_in_a_saved_model_runs_without_trust(bench):
         (["--expert", "mass=1x=nothing"], 3, "'nothing'"),
         (["--expert", "mass=1x=text.zip"], 2, "runs the code in it"),
         (["--expert", "mass=1x=text.zip", "--trust"], 4, "not saved by stable-baselines3"),
-        (["--expert", "mass=4x=text.zip", "--trust"], 2, "an expert of mass=4x"),
+        (["--expert", "mass=4x=text.zip", "--trust"], 2, "--expert names mass=4x"),
         (["--expert", "mass=1x=text.zip"] * 2, 2, "two experts of mass=1x"),
         (["--expert", "mass=1x=pole.zip", "--trust"], 2, "has observations in Box"),
         (["--expert", "mass=1x=a2c.zip", "--trust"], 4, "another algorithm than PPO, SAC"),
