@@ -15,12 +15,14 @@ from irlcli.experiments import facts
 from irlcli.experiments.inputs import source_in
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import made_by
-from irlcli.experiments.tables import Row as TableRow
 from irlcli.interventions import listed_settings, without_cue
 from irlcli.report.parameters import ASSESS, CUE, Cell, Row, Run
 from irlcli.stages import report, report_experts
 from irlcli.stages.base import Request, Source
 from irlcli.store import Artefact
+
+# Row, method and seed.
+_Run = tuple[str, str, int]
 
 
 def request(plan: Plan, command: str) -> Request:
@@ -32,9 +34,10 @@ def request(plan: Plan, command: str) -> Request:
     if plan.figure is not None:
         return plan.figure
     cells, sources = _cells(plan)
-    made = _choices(plan)
+    choices = _choices(plan)
     sources |= {
-        report.choice_role(*run): source_in(one, "choice.json") for run, one in made.items()
+        report.choice_role(*run): source_in(choice, "choice.json")
+        for run, (_, choice) in choices.items()
     }
     if not any(cell.run for cell in cells):
         raise NotFound(
@@ -53,7 +56,7 @@ def request(plan: Plan, command: str) -> Request:
         title=plan.table.title,
         command=command,
         measures=tuple(m for m in plan.table.measures if m not in (ASSESS, CUE)),
-        rows=tuple(_rows(plan, made)),
+        rows=tuple(_rows(plan, choices)),
         methods=plan.table.compared,
         variants=plan.table.variants,
         learned_by=plan.table.methods[0] if plan.table.variants else "",
@@ -144,7 +147,7 @@ def _artefacts(plan: Plan) -> dict[str, Artefact]:
     return {artefact.id: artefact for artefact in held if artefact is not None}
 
 
-def _rows(plan: Plan, choices: Mapping[tuple[str, str, int], Artefact]) -> list[Row]:
+def _rows(plan: Plan, choices: Mapping[_Run, tuple[float, Artefact]]) -> list[Row]:
     rows = []
     for row in plan.table.rows:
         config = plan.config(row.env)
@@ -168,38 +171,30 @@ def _rows(plan: Plan, choices: Mapping[tuple[str, str, int], Artefact]) -> list[
                 unseen=str(unseen[0]),
                 demonstrations=demos.parameters.episodes,
                 config=msgspec.to_builtins(configs),
-                chosen=_weights(plan, row, choices),
+                chosen=_weights(plan, f"{row.env} {row.knob}", choices),
             )
         )
     return rows
 
 
-def _choices(plan: Plan) -> dict[tuple[str, str, int], Artefact]:
-    """The choices of a lambda that the store holds, by row, method and seed."""
+def _choices(plan: Plan) -> dict[_Run, tuple[float, Artefact]]:
+    """Each lambda that was chosen, and the artefact of the choice, where the store holds it."""
     found = {}
     for row, method, seed in product(plan.table.rows, plan.table.methods, plan.table.seeds):
-        reward = _reward(plan, row, method, seed)
-        if reward is not None and "penalty choice" in reward.inputs:
-            choice = _held(plan, made_by(reward.inputs["penalty choice"]))
+        task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")
+        if task is not None and "penalty choice" in task.request.inputs:
+            choice = _held(plan, made_by(task.request.inputs["penalty choice"]))
             if choice is not None:
-                found[f"{row.env} {row.knob}", method, seed] = choice
+                weight = task.request.parameters.airl.penalty_weight
+                found[f"{row.env} {row.knob}", method, seed] = weight, choice
     return found
 
 
 def _weights(
-    plan: Plan, row: TableRow, choices: Mapping[tuple[str, str, int], Artefact]
+    plan: Plan, row: str, choices: Mapping[_Run, tuple[float, Artefact]]
 ) -> dict[str, float]:
     """Each lambda of the table's own, by method, and each chosen one, by ``METHOD SEED``."""
     listed = {} if plan.selection.candidates else plan.table.penalty_weights
     found = {method: weight for method, weight in listed.items() if method in plan.table.methods}
-    for name, method, seed in choices:
-        reward = _reward(plan, row, method, seed)
-        if name == f"{row.env} {row.knob}" and reward is not None:
-            found[f"{method} {seed}"] = reward.parameters.airl.penalty_weight
-    return found
-
-
-def _reward(plan: Plan, row: TableRow, method: str, seed: int) -> Request | None:
-    """What learns the reward of ``method`` and ``seed``, if the plan has it."""
-    task = plan.tasks.get(f"{plan.selection.tag}.{row}.{method}.{seed}")
-    return None if task is None else task.request
+    chosen = {f"{m} {seed}": weight for (r, m, seed), (weight, _) in choices.items() if r == row}
+    return found | chosen

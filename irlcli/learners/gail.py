@@ -4,8 +4,8 @@ Algorithm 1 of :mod:`irlcli.learners.airl` with another discriminator and anothe
 discriminator is D = sigmoid(g(s, a)), without log pi and without shaping. The policy earns
 -log(1 - D), which is never negative, where AIRL's earns log D - log(1 - D).
 
-Imitation is GAIL's aim: at its optimum D is 1/2 everywhere, so g is zero and carries no information. What is
-frozen and retrained on is the last g, as for every learner.
+Imitation is GAIL's aim: at its optimum D is 1/2 everywhere, so g is zero and carries no
+information. What is frozen and retrained on is the last g, as for every learner.
 """
 
 from __future__ import annotations
