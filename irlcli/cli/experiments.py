@@ -246,7 +246,11 @@ def run(
             if ended is None:
                 return
             outcome = ended
-        if not outcome.interrupted and until is None:
+        if until is not None:
+            # Otherwise the report has them.
+            for name, found in plan.choices():
+                session.console.say(f"{name}: {found}")
+        elif not outcome.interrupted:
             _report(session, runner, plan, choice, directory, outcome)
     _raise_for(outcome, plan, _JOBS_GO_ON if cluster == "slurm" else _CONTINUE)
     if session.as_json and until is not None:

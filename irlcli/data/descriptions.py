@@ -368,6 +368,10 @@ class PenaltyChoice(Struct, frozen=True, kw_only=True):
         if self.chosen not in self.weights:
             raise ValueError(f"it chose {self.chosen:g}, which is no candidate")
 
+    def __str__(self) -> str:
+        tied = f", tied with {self.ties - 1} more: the smallest is taken" if self.ties > 1 else ""
+        return f"lambda {self.chosen:g} was the best of {','.join(f'{w:g}' for w in self.weights)}{tied}"
+
 
 class SettingSummary(Struct, frozen=True, kw_only=True):
     """The demonstrations of one setting. Imported ones may have no true reward."""

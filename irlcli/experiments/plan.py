@@ -5,6 +5,7 @@ from functools import cache
 from typing import Any, Literal, NamedTuple
 
 from irlcli.configs import Config
+from irlcli.data.descriptions import PenaltyChoice
 from irlcli.errors import UsageError, closest
 from irlcli.experiments import figures, rows
 from irlcli.experiments.rows import PHASES, Chosen, RewardRun, Task
@@ -177,6 +178,13 @@ class Plan:
     def chooses(self, name: str) -> bool:
         """Whether the step chooses a lambda: once it exists, later requests differ (:meth:`refresh`)."""
         return self.tasks[name].request.stage == choose_penalty.STAGE
+
+    def choices(self) -> Iterator[tuple[str, PenaltyChoice]]:
+        """The choices of lambda that were made, by the step's name."""
+        for name in filter(self.chooses, self.tasks):
+            found = rows.choice_made(self.tasks[name].request, self.lookup)
+            if found is not None:
+                yield name, found
 
 
 def _cached(config_of: ConfigOf) -> ConfigOf:

@@ -101,14 +101,20 @@ class Chosen(NamedTuple):
 
     def weight(self, choice: Request) -> float | None:
         """The lambda that ``choice`` led to; None if it was not made yet."""
-        made = self.lookup(choice).artefact
-        path = self.lookup.file(choice, "choice.json")
-        if made is None or path is None:
-            return None
-        if file_digest(path) != made.output("choice.json").sha256:
-            # What needs it reports the damage when it reads the file.
-            return None
-        return descriptions.convert(read_json(path), descriptions.PenaltyChoice, path).chosen
+        found = choice_made(choice, self.lookup)
+        return None if found is None else found.chosen
+
+
+def choice_made(choice: Request, lookup: Lookup) -> descriptions.PenaltyChoice | None:
+    """What ``choice`` led to; None if it was not made yet, or if its file is damaged."""
+    made = lookup(choice).artefact
+    path = lookup.file(choice, "choice.json")
+    if made is None or path is None:
+        return None
+    if file_digest(path) != made.output("choice.json").sha256:
+        # What needs it reports the damage when it reads the file.
+        return None
+    return descriptions.convert(read_json(path), descriptions.PenaltyChoice, path)
 
 
 class _RowRequests:

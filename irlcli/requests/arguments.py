@@ -100,7 +100,7 @@ def named_settings(
                 f"write {text}=VALUE,VALUE",
             )
         return listed_settings(env, text, values)
-    if origin is None and not text.strip():
+    if origin is None and not text.strip(" ,"):
         raise UsageError(f"{option} is empty", f"write {option} KNOB=VALUE,VALUE")
     if origin is None and not text[:1].isalpha():
         raise UsageError(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from irlcli.configs.documents import read_toml
 from irlcli.configs.load import in_profile
 from irlcli.errors import UsageError, suggest
+from irlcli.methods import METHODS
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession, check_path
 
@@ -121,6 +122,12 @@ def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
             hint = f"set airl.penalty_weight in [{table.name}.variants]" if table.variants else ""
             raise UsageError(
                 f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
+            )
+        if all(METHODS[name].penalty == "none" for name in table.methods):
+            weighed = ", ".join(name for name, m in METHODS.items() if m.penalty != "none")
+            raise UsageError(
+                f"--choose-penalty: no method of {', '.join(table.methods)} has a penalty to weigh",
+                f"add one to --methods: {weighed}",
             )
         arguments.check_chosen(session.overrides)
         candidates = arguments.weights(choice.choose_penalty)

@@ -70,12 +70,12 @@ def train_airl(
     basis: dict[str, Source] = {}
     if choose_penalty is not None:
         # A bad option must fail before the choice of lambda, which takes long.
-        airl_stage.request(source, env, settings, airl, seed)
         arguments.check_chosen(session.overrides, penalty_weight)
         if name is not None:
             session.store.check_name(name)
         weights = arguments.weights(choose_penalty)
         request = choice.request(source, env, settings, airl, config.evaluation, weights, seed)
+        airl_stage.request(source, env, settings, airl, seed)
         chosen = _chosen(session, request)
         if chosen is None:
             return None
@@ -91,9 +91,7 @@ def _chosen(session: StageSession, request: Request) -> tuple[float, Source] | N
         return None
     made, path = prepared
     found = descriptions.convert(read_json(path), descriptions.PenaltyChoice, path)
-    tied = f", tied with {found.ties - 1} more: the smallest is taken" if found.ties > 1 else ""
-    tried = ",".join(f"{weight:g}" for weight in found.weights)
-    session.console.say(f"lambda {found.chosen:g} was the best of {tried}{tied} ({path})")
+    session.console.say(f"{found} ({path})")
     return found.chosen, source_in(made, "choice.json")
 
 

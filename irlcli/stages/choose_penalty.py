@@ -1,5 +1,6 @@
 """lambda by leaving one training setting out: model selection that touches no OOD setting."""
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -42,10 +43,12 @@ def request(
     Raises:
         UsageError: fewer than two weights; fewer than two settings, or than three if the penalty
             compares settings or their labels are shuffled; a method without penalty; a round that
-            is selected by one of the settings.
+            is selected by one of the settings; worlds that the settings cannot share equally, with
+            one left out and all together.
     """
     texts = tuple(str(s) for s in settings)
     candidates = _candidates(airl, texts, weights)
+    _check_worlds(airl.ppo.n_envs, len(texts))
     inputs = {}
     for weight in candidates:
         config = msgspec.structs.replace(airl, penalty_weight=weight)
@@ -80,7 +83,7 @@ def _candidates(
         )
     if len(candidates) < 2:
         raise UsageError(
-            "--choose-penalty needs at least two candidates",
+            "--choose-penalty needs at least two different candidates",
             "for example --choose-penalty 0.1,1,10",
         )
     if (penalty.compares or airl.grouping == "shuffled") and len(settings) < 3:
@@ -95,6 +98,16 @@ def _candidates(
             "select the last round, or by episodes",
         )
     return candidates
+
+
+def _check_worlds(n_envs: int, settings: int) -> None:
+    """Refuse worlds that the trials, in one setting fewer, or the reward cannot share equally."""
+    if n_envs % (settings - 1) or n_envs % settings:
+        raise UsageError(
+            f"airl.ppo.n_envs = {n_envs}: --choose-penalty trains in {settings - 1} settings, with one "
+            f"left out, and in all {settings}, and these cannot both share the worlds equally",
+            f"--set airl.ppo.n_envs to a multiple of {math.lcm(settings - 1, settings)}",
+        )
 
 
 def _role(weight: float, setting: str) -> str:

@@ -88,6 +88,7 @@ WRONG = [
     ("evaluate --idle --env lunar-lander --ood ''", 2, "--ood is empty"),
     ("evaluate --idle --env lunar-lander --intervention ''", 2, "--intervention is empty"),
     (f"evaluate --expert --trained-in '' {LANDER}", 2, "--trained-in is empty"),
+    (f"evaluate --expert --trained-in , {LANDER}", 2, "--trained-in is empty"),
     ("evaluate --policy airl --ood slow", 2, "'slow'"),
     ("evaluate --policy airl --env moon", 2, "'moon'"),
     ("evaluate --policy airl --env test-world", 2, "test-world"),

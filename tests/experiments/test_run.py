@@ -334,6 +334,9 @@ def test_lambda_is_chosen_before_the_reward_is_learned(irl, tmp_path, smoke_stor
     assert len(store.names()) == 13  # two experts, demos, four rewards and returns, choice, reward
     planned = irl("plan", *words, "--until", "rewards", "--json")
     assert json.loads(planned.out)["counts"]["HIT"] == 13
+    # No report follows, so the run says what was chosen.
+    told = irl("run", *words, "--until", "rewards")
+    assert told.code == 0 and f"{name}.choice: lambda {weight:g} was the best of 1,10" in told.err
 
 
 def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):

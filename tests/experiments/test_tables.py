@@ -251,6 +251,14 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         assert f"lunar-lander.bounce, {method}: " in told and "2 settings are too few" in told
         assert "--" not in told.splitlines()[-1]
     assert "--choose-penalty" in refused("run", "experts", "--choose-penalty", "1,2", "--tag", "x")
+    unweighed = ["table1", "--methods", "erm,erm-balanced", "--choose-penalty", "1,2", "--tag", "x"]
+    told = refused("plan", *unweighed)
+    assert "no method of erm, erm-balanced has a penalty" in told and "irm" in told.splitlines()[-1]
+    five = ["table1-5", "--rows", "lunar-lander.engine-power", "--methods", "irm", "--tag", "x"]
+    for worlds in (4, 5):
+        unequal = f"airl.ppo.n_envs={worlds}"
+        told = refused("plan", *five, "--choose-penalty", "1,2", "--set", unequal)
+        assert "a multiple of 20" in told.splitlines()[-1]
     own = tmp_path / "mine.toml"
     own.write_text(SOUND.replace("leg-length", "leg-lenght"))
     assert f"{own}: mine.rows" in refused("plan", "mine", "--experiments", own)
