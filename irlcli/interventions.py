@@ -10,7 +10,7 @@ several knobs: ``friction=0.5,mass=2x``.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from irlcli.envs.registry import ENVIRONMENTS, environment
@@ -57,6 +57,9 @@ class Value(NamedTuple):
     def argument(self) -> float | tuple[float, ...]:
         """What the environment's keyword argument receives."""
         return self.numbers[0] if len(self.numbers) == 1 else self.numbers
+
+
+_UNCHANGED = Value("multiplier", (1.0,))
 
 
 class Setting(NamedTuple):
@@ -257,8 +260,7 @@ def check_distinct(where: str, settings: Sequence[Setting]) -> None:
     """
     for i, setting in enumerate(settings):
         for other in settings[:i]:
-            # HalfCheetah's leg-length=1 is leg-length=1x, but not known to be the default.
-            if changed(setting) == changed(other) or _named(setting) == _named(other):
+            if same(setting, other):
                 again = f", once as {setting}" if setting != other else ""
                 raise UsageError(
                     f"{where} names {other} twice{again}",
@@ -266,32 +268,28 @@ def check_distinct(where: str, settings: Sequence[Setting]) -> None:
                 )
 
 
-def changed(setting: Setting) -> dict[str, tuple[float, ...]]:
-    """The numbers of each knob that a setting changes, equal for 10 and 10..10."""
-    return _named(_effective(setting))
-
-
-def _named(setting: Setting) -> dict[str, tuple[float, ...]]:
-    return {knob: _numbers(value) for knob, value in setting.changes}
-
-
-def _effective(setting: Setting) -> Setting:
-    """``setting`` without its multipliers of 1, which change nothing."""
-    unchanged = Value("multiplier", (1.0,))
-    return Setting(tuple(change for change in setting.changes if change[1] != unchanged))
-
-
 def _numbers(value: Value) -> tuple[float, ...]:
     form, numbers = value
     return numbers[:1] if form == "range" and numbers[0] == numbers[1] else numbers
 
 
+def same(one: Setting, other: Setting) -> bool:
+    """Whether two settings change the same knobs to the same values: 10 is 10..10."""
+    return covers(one, other) and covers(other, one)
+
+
 def covers(wide: Setting, narrow: Setting) -> bool:
     """Whether ``narrow`` only has knob values of ``wide``, as -5 and -5..0 are of -10..0."""
-    wide, narrow = _effective(wide), _effective(narrow)
-    return wide.knobs == narrow.knobs and all(
-        _covers(value, other)
-        for (_, value), (_, other) in zip(wide.changes, narrow.changes, strict=True)
+    return _agree(wide, narrow, _covers)
+
+
+def _agree(one: Setting, other: Setting, values: Callable[[Value, Value], bool]) -> bool:
+    """Whether ``values`` holds for each knob; one that a setting does not name is multiplied by 1."""
+    a, b = dict(one.changes), dict(other.changes)
+    # HalfCheetah's leg-length=1 is leg-length=1x, but not known to be the default.
+    return all(
+        values(a[knob], b[knob]) if knob in a and knob in b else {**a, **b}[knob] == _UNCHANGED
+        for knob in {**a, **b}
     )
 
 
@@ -304,11 +302,7 @@ def _covers(wide: Value, narrow: Value) -> bool:
 
 def overlap(one: Setting, other: Setting) -> bool:
     """Whether two settings share knob values: for each knob one covers the other, or ranges overlap."""
-    one, other = _effective(one), _effective(other)
-    return one.knobs == other.knobs and all(
-        _overlap(value, another)
-        for (_, value), (_, another) in zip(one.changes, other.changes, strict=True)
-    )
+    return _agree(one, other, _overlap)
 
 
 def _overlap(one: Value, other: Value) -> bool:

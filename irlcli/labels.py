@@ -36,6 +36,9 @@ def describe(record: KeyRecord) -> str:
     parts += settings if isinstance(settings, list | tuple) else [parameters.get("setting")]
     noise = parameters.get("noise")
     parts += [f"noise {noise}"] if noise else []
+    weights = parameters.get("weights")
+    if isinstance(weights, list | tuple) and weights:
+        parts.append(f"lambda among {', '.join(map(_number, weights))}")
     return _joined([*parts, *_made(record)])
 
 
@@ -48,8 +51,11 @@ def environment_of(parameters: Mapping[str, Any]) -> Any:
 def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
     """What an evaluation's policy and a retrained policy's reward were made from, if stored.
 
-    ``makers`` maps the sha256 of every stored output to the record of the stage that made it.
+    Of a choice of lambda, the method. ``makers`` maps the sha256 of every stored output to the
+    record of the stage that made it.
     """
+    if record.stage == "choose-penalty":
+        return _method_of_choice(record, makers)
     parts = []
     measured_by = record.inputs.get("reward") if record.stage == "evaluate" else None
     under = retrained(ceiling=record.parameters.get("ceiling"))
@@ -65,6 +71,17 @@ def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
         reward = ["a file"] if maker is None else _made(maker)
         parts.append(_joined(["by the reward of", *reward, under]))
     return "".join(f" {part}" for part in parts)
+
+
+def _method_of_choice(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
+    """The method of the students that a choice of lambda compares; empty if none is stored."""
+    for sha256 in record.inputs.values():
+        measured = makers.get(sha256)
+        student = measured and makers.get(measured.inputs.get("policy", ""))
+        config = student and student.parameters.get("airl")
+        if isinstance(config, dict) and config.get("grouping") is not None:
+            return f" for {method_name(config)}"
+    return ""
 
 
 def budget(parameters: Mapping[str, Any]) -> str:
@@ -139,8 +156,7 @@ def _averaged(config: Mapping[str, Any]) -> str | None:
 def _challenged(challenger: Mapping[str, Any]) -> str | None:
     if not challenger.get("life"):
         return None
-    mixed = "mixed " if challenger.get("mixed_share") else ""
-    return f"with {mixed}challengers" + (" per setting" if challenger.get("per_setting") else "")
+    return "with challengers" + (" per setting" if challenger.get("per_setting") else "")
 
 
 def retrained(

@@ -105,13 +105,20 @@ class LearnedReward:
         """Refuse an environment of other observations or actions, before its first step.
 
         Raises:
-            ValueError: names both.
+            ValueError: spaces of another kind or size; names both.
         """
-        from gymnasium.spaces import Discrete, MultiDiscrete
+        from gymnasium.spaces import Box, Discrete, MultiDiscrete
         from gymnasium.spaces.utils import flatdim
 
         from irlcli.learners.frozen import actions_in_words
 
+        if not isinstance(observation_space, Box) or not isinstance(
+            action_space, Box | Discrete | MultiDiscrete
+        ):
+            raise ValueError(
+                f"the environment has observations in {observation_space} and actions in {action_space}, "
+                "the reward takes vectors (Box), and actions in Box, Discrete or MultiDiscrete"
+            )
         choices: tuple[int, ...] = ()
         if isinstance(action_space, MultiDiscrete):
             choices = tuple(action_space.nvec.ravel().tolist())

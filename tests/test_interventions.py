@@ -24,6 +24,7 @@ from irlcli.interventions import (
     parse_setting,
     parse_settings,
     parse_value,
+    same,
 )
 
 LANDER = "lunar-lander"
@@ -358,12 +359,24 @@ def test_a_multiplier_of_one_is_the_default():
         parse_setting("ant", text)
         for text in ("default", "mass=1x", "leg-length=2x,mass=1x", "leg-length=2x")
     )
-    for one, same in ((default, once), (both, other)):
-        assert covers(one, same) and covers(same, one) and overlap(one, same)
-        with pytest.raises(UsageError, match=f"names {one} twice, once as {same}"):
-            check_distinct("the command", [one, same])
+    for one, equal in ((default, once), (both, other)):
+        assert same(one, equal) and overlap(one, equal)
+        with pytest.raises(UsageError, match=f"names {one} twice, once as {equal}"):
+            check_distinct("the command", [one, equal])
     assert not overlap(once, both)
     check_distinct("the command", [once, both])
+
+
+def test_a_number_in_two_forms_is_one_world():
+    """HalfCheetah's legs of 1 are those of 1x. That this is the default, only the environment knows."""
+    absolute, multiple, default = (
+        parse_setting("half-cheetah", text) for text in ("leg-length=1", "leg-length=1x", "default")
+    )
+    assert same(absolute, multiple) and same(multiple, default) and not same(absolute, default)
+    assert overlap(absolute, multiple) and not overlap(absolute, default)
+    heavy = parse_setting("half-cheetah", "leg-length=1,mass=2x")
+    assert same(heavy, parse_setting("half-cheetah", "leg-length=1x,mass=2x"))
+    assert not covers(heavy, multiple) and not overlap(heavy, multiple)
 
 
 GRAMMAR = st.text("0123456789.xe:+-,= \n", max_size=20)

@@ -287,7 +287,6 @@ CHANGED = {
     "airl.averaged_by": "learning-rate",
     "airl.plateau_rounds": 3,
     "airl.symmetries": True,
-    "airl.challenger.mixed_share": 0.5,
     "airl.challenger.per_setting": True,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
@@ -562,12 +561,6 @@ def test_rounds_of_equal_weight_are_in_no_key():
     for name, value in (("airl.learning_rate_schedule", "constant"), ("airl.averaged_rounds", 1)):
         one, other = (with_field(config, name, value) for config in (weighted, equal))
         assert key(airl(one)) == key(airl(other))
-
-
-def test_unmixed_challengers_are_in_no_key():
-    name = "airl.challenger.mixed_share"
-    none, half = (with_field(in_use(), name, share) for share in (0.0, 0.5))
-    assert key(airl(none)) == key(airl(in_use())) != key(airl(half))
 
 
 def test_one_challenger_in_all_settings_is_in_no_key():

@@ -315,6 +315,7 @@ def test_an_environment_of_other_spaces_is_refused_before_its_first_step(tmp_pat
         (gymnasium.spaces.MultiDiscrete([2, 3]), "discrete actions of 2 x 3 choices"),
         (gymnasium.spaces.Discrete(5), "5 discrete actions"),
         (gymnasium.spaces.Box(-1, 1, (5,)), "actions of size 5"),
+        (gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(5)]), "actions in Tuple"),
     ],
 )
 def test_several_choices_are_compared_one_by_one(actions, words):
@@ -328,6 +329,15 @@ def test_several_choices_are_compared_one_by_one(actions, words):
         return
     with pytest.raises(ValueError, match=words):
         check(observations, actions)
+
+
+def test_only_vectors_are_observations():
+    """One of four states flattens to size 4, but a wrapper would hand over an index."""
+    network = SimpleNamespace(observation_size=4, action_size=5, discrete=True, choices=())
+    about = SimpleNamespace(env="x", settings=(), method="erm", seed=0, network=network)
+    check = irlcli.rewards.LearnedReward(None, about).check_spaces
+    with pytest.raises(ValueError, match=r"observations in Discrete\(4\)"):
+        check(gymnasium.spaces.Discrete(4), gymnasium.spaces.Discrete(5))
 
 
 # The file

@@ -101,7 +101,7 @@ def print_assessment(assessment: Assessment) -> None:
             r.policy,
             _measured(r.true_regret),
             _measured(r.learned_gap),
-            _verdict(assessment.verdicts(s.setting).get(r.policy)),
+            _verdict(r),
             "-" if r.ceiling is None else f"{r.ceiling:g}",
         ]
         for s in assessment.settings
@@ -119,8 +119,8 @@ def print_assessment(assessment: Assessment) -> None:
         out.print_table(columns, splits, stderr=True)
 
 
-def _verdict(of: RegretSplit | None) -> str:
-    if of is None:
+def _verdict(of: RegretSplit) -> str:
+    if of.verdict is None:
         return "-"
     return of.verdict if of.clear else f"{of.verdict}, uncertain"
 

@@ -214,12 +214,7 @@ def _challenger(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     # Before what follows from the number of worlds: a minibatch is at most a rollout.
     ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
     ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
-    challenger = replace(
-        airl.challenger,
-        ppo=ppo,
-        mixed_share=airl.challenger.mixed_share or UNSET,
-        per_setting=airl.challenger.per_setting or UNSET,
-    )
+    challenger = replace(airl.challenger, ppo=ppo, per_setting=airl.challenger.per_setting or UNSET)
     return replace(airl, challenger=challenger)
 
 

@@ -37,7 +37,6 @@ ADAM_EPS = 1e-8
 UNSET_MEANS: dict[str, Any] = {
     "adam_eps": ADAM_EPS,
     "restarts": 1,
-    "mixed_share": 0.0,
     "per_setting": False,
     "dropout": 0.0,
     "columns": (),
@@ -209,8 +208,6 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         ceiling: quantile of g on the demonstrations that bounds a challenger's reward.
         replay_episodes_per_round, replay_capacity: episodes of each setting that a round adds, and the
             most that are kept; all past rounds are equally likely.
-        mixed_share: of the challengers' samples, those whose numbers are mixed with an expert's;
-            see :mod:`irlcli.learners.mixing`.
         per_setting: each setting has a challenger of its own, as a retrained policy acts in one
             setting only, in its share of the worlds. Otherwise one acts in all. Unset is false.
         ppo: as that of the retrained policies where a settings file is silent; with as many worlds
@@ -222,7 +219,6 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     ceiling: Quantile = 0.9
     replay_episodes_per_round: Count = 2
     replay_capacity: Count = 200
-    mixed_share: Fraction | UnsetType = UNSET
     per_setting: bool | UnsetType = UNSET
     ppo: PPOConfig = PPOConfig()
 

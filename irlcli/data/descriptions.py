@@ -239,6 +239,7 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
         learned_gap: learned return of the expert minus the policy's, both under ``ceiling``.
         ceiling: of the rewards that the policy was trained on, as a quantile of g on the
             demonstrations; None without.
+        verdict: None where the expert earns no more than the random agent.
         clear: whether the differences that decide the verdict exceed two standard errors: of the
             regret to the allowed one and, unless retrained, of the learned returns.
         from_student: whether the policy began as the reward's student.
@@ -247,7 +248,7 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
     policy: str
     true_regret: Measured
     learned_gap: Measured
-    verdict: Verdict
+    verdict: Verdict | None
     clear: bool
     ceiling: Finite | None = None
     from_student: bool = False
@@ -306,22 +307,8 @@ class Assessment(Struct, frozen=True, kw_only=True):
 
     @property
     def weak_settings(self) -> list[str]:
-        """Settings with verdicts that mean nothing: the expert earns no more than the random agent."""
-        found = []
-        for s in self.settings:
-            mean = {e.kind: e.true.mean for e in self.bank if e.setting == s.setting}
-            if s.retrained and mean["expert"] <= mean["random"]:
-                found.append(s.setting)
-        return found
-
-    def verdicts(self, setting: str) -> dict[str, RegretSplit]:
-        """The policies retrained in ``setting`` on which there is a verdict, by name.
-
-        None in a weak setting.
-        """
-        if setting in self.weak_settings:
-            return {}
-        return {r.policy: r for s in self.settings if s.setting == setting for r in s.retrained}
+        """Settings without verdicts, because the expert earns no more than the random agent."""
+        return [s.setting for s in self.settings if any(r.verdict is None for r in s.retrained)]
 
 
 class HintContrast(Struct, frozen=True, kw_only=True):

@@ -46,7 +46,7 @@ def request(plan: Plan, command: str) -> Request:
     artefacts = _artefacts(plan)
     runs, libraries = facts.runs(artefacts.values())
     if plan.table.kind == "experts":
-        return _experts(plan, command, cells, sources, runs)
+        return _experts(plan, command, cells, sources, runs, libraries)
     wanted = [plan.lookup.record(task.request) for task in plan.tasks.values()]
     others = facts.left_out(
         plan.lookup.store.artefacts(), [record for record in wanted if record], set(artefacts)
@@ -76,6 +76,7 @@ def _experts(
     cells: Sequence[Cell],
     sources: Mapping[str, Source],
     runs: dict[str, Run],
+    libraries: dict[str, dict[str, str | None]],
 ) -> Request:
     if not any(cell.run for cell in cells if cell.agent == "expert"):
         raise NotFound(
@@ -95,6 +96,7 @@ def _experts(
         bars={name: expert.bar for name, expert in experts.items() if expert.bar is not None},
         cells=tuple(cells),
         runs=runs,
+        libraries=libraries,
     )
     return report_experts.request(parameters, sources)
 

@@ -103,10 +103,10 @@ def _bank(assessment: Assessment) -> list[dict[str, Any]]:
 
     ``clear`` is False for a verdict that is uncertain.
     """
-    verdicts = {s.setting: assessment.verdicts(s.setting) for s in assessment.settings}
+    splits = {(s.setting, r.policy): r for s in assessment.settings for r in s.retrained}
     rows = []
     for entry in assessment.bank:
-        split = verdicts.get(entry.setting, {}).get(entry.policy)
+        split = splits.get((entry.setting, entry.policy))
         rows.append(
             {
                 "setting": entry.setting,
@@ -118,7 +118,7 @@ def _bank(assessment: Assessment) -> list[dict[str, Any]]:
                 "learned_error": entry.learned.error,
                 "progress": entry.progress,
                 "verdict": split and split.verdict,
-                "clear": split and split.clear,
+                "clear": split.clear if split and split.verdict else None,
             }
         )
     return rows

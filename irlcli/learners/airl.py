@@ -41,7 +41,6 @@ from irlcli.learners.cloning import clone
 from irlcli.learners.discriminator import measured, minibatch_loss, penalty_weight_at
 from irlcli.learners.grouping import Part, group
 from irlcli.learners.images import Images
-from irlcli.learners.mixing import mixed
 from irlcli.learners.pools import (
     Minibatch,
     Pool,
@@ -297,8 +296,6 @@ class AIRL:
                 challenger = None
                 if challenger_risks is not None:
                     challenger = self._sampled(challenger_risks, generator)
-                    if config.challenger.mixed_share:
-                        challenger = mixed(challenger, config.challenger.mixed_share, generator)
                 loss = minibatch_loss(
                     self.model, batch, challenger, self._weights, config, weight, generator
                 )

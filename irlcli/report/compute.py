@@ -289,9 +289,8 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
                 continue
-            judged = [
-                _judged(r, random) for r in both.itertuples() if r.true_return_expert > random
-            ]
+            every = (_judged(pair, random) for pair in both.itertuples())
+            judged = [judgement for judgement in every if judgement.verdict is not None]
             verdicts = [judgement.verdict for judgement in judged]
             scores = both[["learned_return", "learned_return_expert"]]
             means = map(float, scores.groupby(both["seed"]).mean().mean())
@@ -324,7 +323,7 @@ def reward_quality(p: Parameters, assessments: Assessments) -> pd.DataFrame:
         if of is None:
             continue
         for s in of.settings:
-            judged = [r for r in of.verdicts(s.setting).values() if not r.from_student]
+            judged = [r for r in s.retrained if r.verdict is not None and not r.from_student]
             found.append(
                 {
                     "row": row.name,

@@ -58,9 +58,9 @@ class Member(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """A verdict, and whether the differences that decide it exceed two standard errors."""
+    """A verdict, or none, and whether the differences that decide it exceed two standard errors."""
 
-    verdict: Verdict
+    verdict: Verdict | None
     clear: bool
 
 
@@ -196,7 +196,7 @@ def return_distance(members: Sequence[Member]) -> float | None:
 def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -> Judgement:
     """Why a retrained policy does not earn what the expert earns, if it does not.
 
-    ``retrained``: its regret is within 10 % of what the expert earns above the random agent.
+    No verdict (None) where the expert earns no more than the random agent. ``retrained``: its regret is within 10 % of what the expert earns above the random agent.
     ``wrong reward``: its learned return is at least the expert's. ``optimisation fell short``: the
     expert's learned return is higher, so the reward still offers more.
 
@@ -204,8 +204,10 @@ def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -
         policy, expert, random: true returns.
         gap: learned return of the expert minus the policy's.
     """
+    if expert.mean <= random.mean:
+        return Judgement(None, False)
     regret = difference(expert, policy)
-    beyond = regret.mean - ALLOWED_REGRET * max(0.0, expert.mean - random.mean)
+    beyond = regret.mean - ALLOWED_REGRET * (expert.mean - random.mean)
     if beyond <= 0.0:
         return Judgement("retrained", _is_clear(beyond, regret))
     verdict: Verdict = "wrong reward" if gap.mean <= 0.0 else "optimisation fell short"

@@ -21,6 +21,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
         bars: the least mean true return of an expert, by row that has a bar.
         cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``; each ``place`` is a setting.
         runs: provenance of the artefacts, by id.
+        libraries: the sets of library versions that occur, by a short name.
     """
 
     command: str
@@ -28,6 +29,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     bars: dict[str, float]
     cells: tuple[Cell, ...]
     runs: dict[str, Run]
+    libraries: dict[str, dict[str, str | None]]
 
 
 def request(parameters: Parameters, sources: Mapping[str, Source]) -> Request:
@@ -72,4 +74,4 @@ def run(job: Job) -> None:
     experts.draw(job.output, p.cells, learning)
 
 
-STAGE = Stage("report-experts", 5, run)
+STAGE = Stage("report-experts", 6, run)

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
 from irlcli import labels
@@ -150,7 +150,9 @@ def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:
 
     p: Parameters = job.parameters
     setting = parse_setting(p.environment.name, p.setting)
-    count = p.transfer.restart_episodes or 0
+    count = p.transfer.restart_episodes
+    # Set wherever there are restarts.
+    assert not isinstance(count, UnsetType)
     job.console.progress(0, count, "episodes", {"measuring": "learned return"})
     found = roll_out(p.environment.name, setting, policy, count, p.seed, "restart score")
     job.warn_of_errors(p.setting, found)

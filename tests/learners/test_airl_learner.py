@@ -291,8 +291,8 @@ CHALLENGED = [
         "gradient_penalty": 1.0,
         "learning_rate_schedule": "linear",
     }
-    | {"challenger": ChallengerConfig(life=life, mixed_share=mixed, per_setting=own, ppo=LONG)}
-    for life, mixed, own in ((1, 0.0, False), (2, 0.5, False), (2, 0.0, True))
+    | {"challenger": ChallengerConfig(life=life, per_setting=own, ppo=LONG)}
+    for life, own in ((1, False), (2, False), (2, True))
 ]
 
 

@@ -12,7 +12,6 @@ from airl_runs import (
     make,
     moved,
     random_episodes,
-    record_losses,
     worlds_of,
 )
 from msgspec.structs import replace
@@ -280,25 +279,6 @@ def test_challengers_per_setting_share_the_worlds_in_the_order_of_the_settings(
 def numbers_of(demos):
     """All numbers in the observations of ``demos``."""
     return np.concatenate([t.observations.ravel() for group in demos for t in group])
-
-
-def test_the_challengers_samples_are_mixed_and_no_others(demos, monkeypatch):
-    """Before the update a challenger's sample tells itself by its numbers: all are of one policy."""
-    config = replace(CHALLENGED["challenger"], mixed_share=1.0)
-    trainer, learner, challengers = challenged(demos, challenger=config, fixed_horizon=False)
-    seen = record_losses(monkeypatch)
-    rollouts, challenge = trainer.train_round(0, learner), challengers.train_round(0)
-    learner.update(0, rollouts, trainer.policy, challenge)
-    acted = {tuple(row) for r in rollouts for row in r.observations.reshape(-1, 8).tolist()}
-    challenged_ = {tuple(row) for r in challenge for row in r.observations.reshape(-1, 8).tolist()}
-    students, theirs = (
-        [{tuple(row) for row in part.observations[:, 0].reshape(-1, 8).tolist()} for part in parts]
-        for parts in zip(*(minibatches[:2] for minibatches in seen), strict=True)
-    )
-    assert all(found <= acted for found in students)
-    assert not any(found <= challenged_ for found in theirs)
-    own = np.concatenate([numbers_of(demos), *(r.observations.ravel() for r in challenge)])
-    assert all(np.isin(part.observations[:, 0], own).all() for _, part, _ in seen)
 
 
 def test_a_challenger_is_paid_the_bounded_reward(demos):

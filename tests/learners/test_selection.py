@@ -182,6 +182,12 @@ def test_lambda_is_the_one_that_does_best_in_the_settings_left_out(chosen):
             assert summary["settings"][0]["mean_return"] == row[setting]
 
 
+def test_ls_shows_the_method_and_the_candidates_of_a_choice(chosen, run_irl):
+    listed = run_irl(["ls", "--store", str(chosen.root)]).out
+    (choice,) = (row for row in listed.splitlines() if "choose-penalty" in row)
+    assert f"{FIRST} {SECOND} lambda among 0.1, 1 seed 0 for irm" in " ".join(choice.split())
+
+
 def test_a_choice_behind_a_url_is_planned_with(chosen, smoke_store, run_irl, tmp_path):
     place = f"memory://{tmp_path.name}"
     assert run_irl(["push", "chosen", "--to", place, "--store", str(chosen.root)]).code == 0

@@ -178,6 +178,7 @@ def test_a_policy_retrained_on_the_reward_is_judged_where_the_expert_is_known(as
     assert split["learned_gap"]["mean"] == pytest.approx(gap)
     shown = irl(*line)
     weak = best["true"]["mean"] <= means["random"]["true"]["mean"]
+    assert (split["verdict"] is None) == weak
     assert (weak or split["verdict"] in shown.err) and "Spearman" in shown.err
     assert ("there is no verdict" in shown.err) == weak
 

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from irlcli.data.steps import Irregular
 from irlcli.errors import UsageError, first_line
-from irlcli.interventions import changed, parse_setting
+from irlcli.interventions import parse_setting, same
 from irlcli.trajectories import ActionSpace
 
 # From a row to where it stands in its source, for messages.
@@ -56,11 +56,11 @@ class Expected:
         of_the_only = [f"{knob}={text}" for knob in knobs] if len(knobs) == 1 else []
         for written in (text, *of_the_only):
             try:
-                found = changed(parse_setting(self.env, written))
+                found = parse_setting(self.env, written)
             except UsageError:
                 continue
             for index, own in enumerate(self.settings):
-                if changed(parse_setting(self.env, own)) == found:
+                if same(parse_setting(self.env, own), found):
                     return index
         raise UsageError(
             f"{place}: setting {text[:80]!r} is not one of {', '.join(self.settings)}",
@@ -80,7 +80,7 @@ class Expected:
             found = parse_setting(self.env, str(name))
         except UsageError:
             return
-        if changed(found) != changed(parse_setting(self.env, only)):
+        if not same(found, parse_setting(self.env, only)):
             raise UsageError(
                 f"{place} is of {found}, as its {SETTING!r} says, not of {only}",
                 "name the settings that the source holds, or rename that column",
