@@ -124,12 +124,13 @@ class ClusterOptions(NamedTuple):
 
 
 def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
-    """The queue that ``--cluster`` names.
+    """The queue that ``--cluster`` names. Warns of submissions to it that cannot be read.
 
     Raises:
         UsageError: Slurm or submitit is missing.
     """
     from irlcli.experiments.cluster.local import Local
+    from irlcli.experiments.cluster.records import unreadable
     from irlcli.experiments.cluster.slurm import Slurm
 
     cluster = options.cluster
@@ -139,6 +140,8 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
             "--cluster needs the package submitit, which is not installed",
             f"in irlcli's checkout: {sys.executable} -m pip install '.[slurm]'",
         )
+    for path in unreadable(session.store):
+        session.console.warn(f"{path} cannot be read: its jobs count as not submitted")
     minutes = parse_minutes(options.time or DEFAULT_TIME)
     # A job of few minutes is warned when half of them are over.
     warning = min(DEFAULTS.warning, 30 * minutes)

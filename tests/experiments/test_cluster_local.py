@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from test_run import REWARDS, ROW, Runs, alive
@@ -201,6 +202,19 @@ def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):
     new_record(store, "local on moon").add([Submitted(step, "identity", "1")])
     done = irl(*runs.words, "--store", store.root, "--status")
     assert done.code == 2 and "local on moon" in done.err and "hint: " in done.err
+
+
+def test_submissions_that_cannot_be_read_are_named(irl, runs, tmp_path):
+    store = Store(tmp_path / "runs")
+    store.create()
+    for name, text in (("newer", '{"schema": 2}'), ("cut", '{"schema": 1, "jo')):
+        (store.jobs / name).mkdir(parents=True)
+        (store.jobs / name / "jobs-0000000.json").write_text(text)
+    done = irl(*runs.words, "--store", store.root, "--status")
+    assert done.code == 0, done.err
+    warnings = [line for line in done.err.splitlines() if line.startswith("warning: ")]
+    assert [Path(line.split()[1]).parent.name for line in warnings] == ["cut", "newer"]
+    assert all("count as not submitted" in line for line in warnings)
 
 
 @pytest.mark.parametrize(

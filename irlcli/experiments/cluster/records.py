@@ -105,16 +105,36 @@ def new_record(store: Store, place: str) -> Record:
 def records(store: Store, place: str | None = None) -> list[Record]:
     """The submissions to the queue at ``place``, or to any, oldest first.
 
-    What cannot be read is left out.
+    What :func:`unreadable` names is left out.
     """
     found: dict[Path, Record] = {}
-    for path in sorted(store.jobs.absolute().glob("*/jobs-*.json")):
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            value = json.loads(path.read_bytes())
-            if value["schema"] == _SCHEMA and place in (None, value["place"]):
-                record = found.setdefault(path.parent, Record(path.parent, value["place"], []))
-                record.jobs += [Submitted(**job) for job in value["jobs"]]
+    for path in _files(store):
+        read = _read(path)
+        if read is not None and place in (None, read.place):
+            found.setdefault(path.parent, Record(path.parent, read.place, [])).jobs += read.jobs
     return list(found.values())
+
+
+def unreadable(store: Store) -> list[Path]:
+    """Files whose jobs are not known: damaged, of a newer irlcli, or not readable by this user."""
+    # gc may have removed one meanwhile.
+    return [path for path in _files(store) if _read(path) is None and path.exists()]
+
+
+def _files(store: Store) -> list[Path]:
+    return sorted(store.jobs.absolute().glob("*/jobs-*.json"))
+
+
+def _read(path: Path) -> Record | None:
+    """The jobs that were submitted together; None if the file cannot be read."""
+    try:
+        value = json.loads(path.read_bytes())
+        if value["schema"] == _SCHEMA:
+            jobs = [Submitted(**job) for job in value["jobs"]]
+            return Record(path.parent, value["place"], jobs)
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return None
 
 
 def ended(
