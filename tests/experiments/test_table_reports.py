@@ -13,6 +13,7 @@ from test_architecture import loaded_by
 
 from irlcli.configs import load_config
 from irlcli.envs.registry import environment
+from irlcli.experiments import provenance
 from irlcli.store import Store
 from irlcli.store.manifest import encode_provenance
 
@@ -499,6 +500,18 @@ def test_a_table_of_experts_may_have_another_name(irl, table_store, tmp_path):
     assert done.code == 0 and re.search(r"^lunar-lander +engine-power=1.5x ", done.err, re.M)
     document = json.loads(irl(*line, "--json").out)
     assert document["report"]["caveats"] == caveats(done)
+
+
+@pytest.mark.parametrize("table", ["table1", "experts"])
+def test_a_report_warns_of_artefacts_of_other_library_versions(
+    irl, table_store, monkeypatch, table
+):
+    line = ["report", table, *ROW, "--store", table_store, "--profile", "smoke", *SMALL]
+    assert "other library versions" not in irl(*line).err
+    present = provenance.libraries()
+    monkeypatch.setattr(provenance, "libraries", lambda: {**present, "torch": "99.0"})
+    told = irl(*line).err
+    assert f"of this report: torch {present['torch']} (now 99.0)" in told
 
 
 def test_no_experts(irl, tmp_path):
