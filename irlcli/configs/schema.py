@@ -320,7 +320,8 @@ class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Paper Table 2: the values trained on (``id``) and the held-out ones (``ood``).
 
     Attributes:
-        episodes: demonstrations of each value trained on, where they differ.
+        episodes: demonstrations of each value trained on, or one count for all, in place of
+            ``demonstrations.episodes``.
         expert, airl, transfer: in a file, this knob's overrides of ``[expert]``, ``[airl]`` and
             ``[transfer]``; once loaded, the whole configs. Challengers follow ``transfer``.
     """
