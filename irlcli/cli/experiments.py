@@ -108,7 +108,7 @@ def plan(
 def _print_plan(session: StageSession, choice: TableChoice, plan: "Plan") -> None:
     from irlcli.experiments.status import STATUSES
 
-    steps = steps_of(plan)
+    steps = steps_of(plan, session.console.warn)
     counts = {status: sum(s["status"] == status for s in steps) for status in STATUSES}
     if session.as_json:
         command = _step_command(session, choice, plan, "irl")

@@ -9,13 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from irlcli.cli import console as out
-from irlcli.cli.options import Ref, store_command
+from irlcli.cli.options import Env, Ref, store_command
 from irlcli.cli.session import Session
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
 from irlcli.experiments.inputs import checked
 from irlcli.experiments.recordings import minari_directory
+from irlcli.requests import arguments
 
 
 @store_command
@@ -29,23 +30,26 @@ def export(
             help="For demos: parquet:FILE or minari:DATASET. For a reward: torch-export:FILE.pt2."
         ),
     ],
+    env: Env = None,
 ) -> None:
     """Write demonstrations or a learned reward in a form that other tools read."""
+    known = arguments.env_name(env)
     kind, _, name = to.partition(":")
     if what not in _TARGETS:
         raise UsageError(f"{what!r} cannot be exported", suggest(what, _TARGETS))
     if kind not in _TARGETS[what] or not name:
         forms = " or ".join(f"--to {form}:NAME" for form in _TARGETS[what])
         raise UsageError(f"{what} cannot be exported to {to!r}", f"write {forms}")
-    path = _TARGETS[what][kind](session, ref, name)
+    path = _TARGETS[what][kind](session, ref, name, known)
     if session.as_json:
         out.print_json("export", {"what": what, "form": kind, "path": str(path)})
     else:
         out.print_data(str(path))
 
 
-def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
+def _demos_to_parquet(session: Session, ref: str, name: str, known: str | None) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
+    arguments.check_env(ref, env, known)
     directory = checked(session.store, source)
     with _new_file(session, Path(name)) as path:
         from irlcli.data.exchange.transitions import write_transitions
@@ -59,8 +63,9 @@ def _demos_to_parquet(session: Session, ref: str, name: str) -> Path:
     return Path(name)
 
 
-def _demos_to_minari(session: Session, ref: str, name: str) -> Path:
+def _demos_to_minari(session: Session, ref: str, name: str, known: str | None) -> Path:
     source, env, _ = references.demonstrations(session.store, ref)
+    arguments.check_env(ref, env, known)
     directory = checked(session.store, source)
     dataset = minari_directory(name).parent
     if os.path.lexists(dataset):
@@ -94,12 +99,13 @@ def _spaces(env: str, setting: str) -> tuple[Any, Any, Any]:
         return world.observation_space, counted_from(world.action_space, start), start
 
 
-def _reward_to_torch(session: Session, ref: str, name: str) -> Path:
+def _reward_to_torch(session: Session, ref: str, name: str, known: str | None) -> Path:
     with _new_file(session, Path(name)) as path:
         from irlcli.data.exchange.torch_export import write_reward
         from irlcli.rewards import load_reward
 
         reward = load_reward(ref, session.store.root)
+        arguments.check_env(ref, reward.env, known)
         write_reward(path, reward.module(), reward.about())
     return Path(name)
 
@@ -110,7 +116,7 @@ def _new_file(session: Session, path: Path) -> AbstractContextManager[Path]:
     return session.whole_file(path, "--to")
 
 
-_TARGETS: dict[str, dict[str, Callable[[Session, str, str], Path]]] = {
+_TARGETS: dict[str, dict[str, Callable[[Session, str, str, str | None], Path]]] = {
     "demos": {"parquet": _demos_to_parquet, "minari": _demos_to_minari},
     "reward": {"torch-export": _reward_to_torch},
 }

@@ -22,6 +22,7 @@ from irlcli.envs.spec import Code
 from irlcli.errors import NotFound, UsageError
 
 _INSTALLED = ("site-packages", "dist-packages")
+_ENDINGS = (*importlib.machinery.EXTENSION_SUFFIXES, *importlib.machinery.SOURCE_SUFFIXES)
 # Written for an installation from a directory, a file or a repository, not from an index (PEP 610).
 _ORIGIN = "direct_url.json"
 
@@ -37,7 +38,7 @@ def code_of(module: str, files: Sequence[str], directory: Path | None, where: st
     """The code of ``module`` as it is now; it is not imported.
 
     The content of a single file includes that of the modules beside it that it imports, and that of
-    a package all its Python files.
+    a package all its Python files. Compiled modules count as well, but not what they import.
 
     Args:
         module: dotted name of a module.
@@ -47,7 +48,8 @@ def code_of(module: str, files: Sequence[str], directory: Path | None, where: st
 
     Raises:
         NotFound: no such module, or a pattern that no file matches.
-        UsageError: two modules of this name, a file that is not Python, or a pattern that leads out.
+        UsageError: two modules of this name, a file that is not Python, or a pattern that is malformed
+            or leads out.
     """
     join_path(directory)
     origin = _origin(module, directory, where)
@@ -56,7 +58,8 @@ def code_of(module: str, files: Sequence[str], directory: Path | None, where: st
     found = {path.relative_to(root).as_posix(): path for path in _further(files, root, where)}
     distribution = _distribution(top, root)
     if distribution is None or distribution.read_text(_ORIGIN):
-        found |= {path.relative_to(root).as_posix(): path for path in _sources(root, top, where)}
+        sources = [origin, *_sources(root, top, where)]
+        found |= {path.relative_to(root).as_posix(): path for path in sources}
     name, version = (distribution.name, distribution.version) if distribution else (None, None)
     return Code(_digest(found) if found else None, name, version)
 
@@ -104,7 +107,13 @@ def _further(files: Sequence[str], root: Path, where: str) -> Iterator[Path]:
                 f"{where}: env.files: {pattern!r} leads out of the module's directory",
                 f"name files below {root}",
             )
-        matching = sorted(path for path in root.glob(pattern) if path.is_file())
+        try:
+            matching = sorted(path for path in root.glob(pattern) if path.is_file())
+        except (ValueError, IndexError, NotImplementedError):
+            raise UsageError(
+                f"{where}: env.files: {pattern!r} is not a pattern of files",
+                "write for example assets/*.xml, or **/*.xml for any depth",
+            ) from None
         if not matching:
             raise NotFound(
                 f"{where}: env.files: no file matches {pattern!r}", f"paths are relative to {root}"
@@ -113,7 +122,7 @@ def _further(files: Sequence[str], root: Path, where: str) -> Iterator[Path]:
 
 
 def _sources(root: Path, module: str, where: str) -> list[Path]:
-    """The Python files of the top-level ``module``, and of those beside it that it imports.
+    """The files of the top-level ``module``, and of those beside it that it imports.
 
     Beside an installed module are its dependencies. They are other distributions, and left out.
     """
@@ -130,16 +139,18 @@ def _sources(root: Path, module: str, where: str) -> list[Path]:
         other = _distribution(name, root) if files else None
         if other is None or (own and other.name == own.name):
             found += files
-            pending += [imported for path in files for imported in _imported(path, where)]
+            written = [path for path in files if path.suffix == ".py"]
+            pending += [imported for path in written for imported in _imported(path, where)]
     return found
 
 
 def _files(root: Path, name: str) -> list[Path]:
-    """The Python files of ``name`` in ``root``: ``name.py`` precedes a folder without __init__.py."""
-    file, folder = root / f"{name}.py", root / name
-    if file.is_file() and not (folder / "__init__.py").is_file():
-        return [file]
-    return sorted(folder.rglob("*.py")) if folder.is_dir() else []
+    """The files of ``name`` in ``root``: a module precedes a folder without __init__.py."""
+    folder = root / name
+    modules = [path for ending in _ENDINGS if (path := root / f"{name}{ending}").is_file()]
+    if modules and not (folder / "__init__.py").is_file():
+        return modules
+    return sorted(path for path in folder.rglob("*") if path.name.endswith(_ENDINGS))
 
 
 def _imported(path: Path, where: str) -> list[str]:

@@ -26,6 +26,8 @@ from irlcli.envs.spec import Code, EnvironmentSpec, Form, Knob, Own
 from irlcli.errors import NotFound, UsageError, suggest
 
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,39}"
+# settings/control.toml is read under this name.
+_RESERVED = "control"
 _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _MAX_NUMBER = 1e300
 # Version of how such environments are stepped (irlcli.envs.adapted, irlcli.rl.rollout); part of
@@ -243,7 +245,7 @@ def _check_name(name: str) -> None:
             f"{name!r} cannot be the name of an environment",
             "write name = ... in [env]: up to 40 letters, digits, '-' and '_', a letter first",
         )
-    if name in ENVIRONMENTS:
+    if name in ENVIRONMENTS or name == _RESERVED:
         raise UsageError(
             f"{name!r} is the name of another environment",
             "rename the file, or write name = ... in [env]",

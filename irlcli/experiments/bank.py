@@ -196,6 +196,8 @@ class Finder:
                 record_.stage == "transfer"
                 and record_.inputs.get("reward") == reward.sha256
                 and record_.parameters.get("setting") == setting
+                and isinstance(record_.parameters.get("transfer"), dict)
+                and any(output.path == "policy.pt" for output in artefact.manifest.outputs)
             ):
                 name = f"retrained {artefact.id[:8]} {labels.retrained_as(record_)}".strip()
                 policy = source_in(artefact, "policy.pt")

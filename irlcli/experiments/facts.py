@@ -53,13 +53,14 @@ def left_out(
     They are grouped by how they differ: from the most similar one, where variants want several.
     ``used`` are the ids of those that the report does use.
     """
-    expected: dict[_Subject, list[KeyRecord]] = {}
+    # By digest: an artefact of somebody else's may hold lists and tables where ours hold text.
+    expected: dict[str, list[KeyRecord]] = {}
     for record in wanted:
-        expected.setdefault(_subject(record), []).append(record)
+        expected.setdefault(digest(_subject(record)), []).append(record)
     groups: dict[tuple[str, str, str], list[str]] = {}
     for artefact in artefacts:
         record = artefact.manifest.record
-        candidates = expected.get(_subject(record), [])
+        candidates = expected.get(digest(_subject(record)), [])
         if not candidates or artefact.id in used:
             continue
         sought = min(candidates, key=lambda other: len(_differing(record, other)))

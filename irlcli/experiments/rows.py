@@ -378,7 +378,8 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Member]]) -> I
         own = entry.kind in ("student", "retrained", "from-student")
         owner = run.name if own else run.shared
         # The sign stays: it tells the expert of goal-y=-900 from that of goal-y=900.
-        policy = re.sub(r"[ ,:]+", "-", entry.policy.replace(f"{row.knob}=", ""))
+        policy = entry.policy.replace(f"{row.knob}=", "").replace("+", "")
+        policy = re.sub(r"[ ,:]+", "-", policy)
         yield Task(f"{owner}.bank.{policy}.{_value(entry.setting)}", "returns", recorded)
     request = assess.request(From(reward.learned, "reward.pt"), row.env, members, reward.label)
     yield Task(f"{run.name}.assess", "returns", request, reward.cell(ASSESS))
@@ -469,4 +470,4 @@ def made_by(source: Source | From) -> Request:
 
 def _value(setting: Setting | str) -> str:
     """A setting's value as a part of a name."""
-    return str(setting).partition("=")[2].replace(":", "_")
+    return str(setting).partition("=")[2].replace(":", "_").replace("+", "")

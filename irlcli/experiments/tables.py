@@ -10,7 +10,7 @@ from msgspec import UNSET, UnsetType
 
 from irlcli.configs.documents import converted, read_toml
 from irlcli.configs.fields import Count, NonNegative, NonNegativeCount
-from irlcli.configs.load import load_config, settings_directory
+from irlcli.configs.load import PROFILES, load_config, settings_directory
 from irlcli.envs.announced import announced
 from irlcli.envs.registry import ENVIRONMENTS, environment, is_known, resolve
 from irlcli.envs.spec import EnvironmentSpec
@@ -255,6 +255,13 @@ def _table(name: str, value: Any, defaults: _Defaults, directory: Path) -> Table
     if settings is not None and not settings.is_file():
         raise UsageError(
             f"{name}.settings: {settings} is not a file", f"a path relative to {directory}"
+        )
+    profiled = next((p for p in PROFILES if f"-{name}".endswith(f"-{p}")), None)
+    if settings is not None and profiled is not None:
+        raise UsageError(
+            f"{name!r} cannot be the name of a table with settings of its own: its results would have "
+            f"the names of those of --profile {profiled}",
+            "give the table another name",
         )
     kind = _one_of(f"{name}.kind", listed.kind, get_args(Kind))
     table = Table(name=name, title=title, kind=kind, settings=settings)

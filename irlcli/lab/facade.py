@@ -370,7 +370,7 @@ class Lab:
         with self._at_work(configs, [], read_only=True) as session:
             plan = planning.open_plan(session, chosen)
             planning.check_tag(session, chosen, plan.table)
-            return PlannedTable(table, planning.steps_of(plan))
+            return PlannedTable(table, planning.steps_of(plan, session.console.warn))
 
     def _session(
         self, configs: Configs, line: Sequence[str], read_only: bool = False

@@ -2,13 +2,13 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from irlcli.configs.documents import read_toml
 from irlcli.configs.load import in_profile
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import IntegrityError, UsageError, suggest
 from irlcli.methods import METHODS
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession, check_path
@@ -189,11 +189,11 @@ def _words(text: str) -> list[str]:
     return [word for word in re.split(r"[,\s]+", text) if word]
 
 
-def steps_of(plan: "Plan") -> list[dict[str, Any]]:
+def steps_of(plan: "Plan", warn: Callable[[str], None]) -> list[dict[str, Any]]:
     """A document for each step of ``plan``.
 
     ``other_versions`` says how the libraries that made an existing artefact differ from those
-    present.
+    present. ``warn`` is told of artefacts whose provenance is damaged.
     """
     documents = []
     for name in plan.tasks:
@@ -206,15 +206,19 @@ def steps_of(plan: "Plan") -> list[dict[str, Any]]:
                 "request": step.label,
                 "why": step.why,
                 "needs": list(plan.needs[name]),
-                "other_versions": _other_versions(step),
+                "other_versions": _other_versions(step, warn),
             }
         )
     return documents
 
 
-def _other_versions(step: "Step") -> list[str]:
+def _other_versions(step: "Step", warn: Callable[[str], None]) -> list[str]:
     from irlcli.experiments import provenance
 
     if step.artefact is None:
         return []
-    return provenance.other_versions(step.artefact.provenance())
+    try:
+        return provenance.other_versions(step.artefact.provenance())
+    except IntegrityError as error:
+        warn(f"{error.message} ({error.hint})")
+        return []

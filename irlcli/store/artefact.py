@@ -49,7 +49,15 @@ class Artefact(NamedTuple):
         Raises:
             IntegrityError: altered or unreadable.
         """
-        return read_provenance(self.directory, self.manifest.id)
+        try:
+            return read_provenance(self.directory, self.manifest.id)
+        except IntegrityError as error:
+            store = self.directory.parent
+            raise IntegrityError(
+                error.message,
+                f"`irl verify {self.id} --store {store}` moves the artefact to quarantine. Then run the "
+                "same command again",
+            ) from None
 
 
 class Published(NamedTuple):

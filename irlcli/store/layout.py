@@ -124,6 +124,9 @@ def check(layout: Layout) -> None:
         path.name not in _OWN and not path.name.startswith(".STORE.")
         for path in root.iterdir()
     ):
+        if marker.exists():
+            # Another process created the store meanwhile.
+            return check(layout)
         raise IntegrityError(
             f"{root} contains files but is not a store",
             "name a store, or an empty or new directory",

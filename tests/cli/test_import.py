@@ -237,6 +237,12 @@ def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, m
     refused = f"row {first} is of engine-power=1.25x, as its 'setting' says, not of engine-power=1x"
     one = [*LANDER[:3], "engine-power=1x"]
     assert_answered(irl("import", exported, *one, *store), 2, refused)
+    # In every type that text has in Arrow.
+    for kind in (pa.large_string(), pa.string_view(), pa.dictionary(pa.int32(), pa.string())):
+        column = pa.array(names.tolist()).cast(kind)
+        typed = table.set_column(table.schema.get_field_index("setting"), "setting", column)
+        pq.write_table(typed, tmp_path / "typed.parquet")
+        assert_answered(irl("import", tmp_path / "typed.parquet", *one, *store), 2, refused)
     parts = []
     for text in ("1.25x", "1x"):
         parts.append(tmp_path / f"{text}.parquet")

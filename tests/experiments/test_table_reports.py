@@ -3,6 +3,7 @@
 import errno
 import json
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -270,6 +271,26 @@ def test_nothing_is_run(report, table_store):
     made = set(Store(table_store).ids()) - before
     store = Store(table_store)
     assert {store.resolve(i).artefact.manifest.record.stage for i in made} == {"report"}
+
+
+def test_a_damaged_provenance_is_named_and_can_be_repaired(report, irl, table_store, tmp_path):
+    copy = tmp_path / "runs"
+    shutil.copytree(table_store, copy, symlinks=True)
+    victim = Store(copy).resolve("demos").artefact
+    path = victim.directory / "provenance.json"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes().replace(b'"seconds"', b'"secondz"'))
+    common = ["--profile", "smoke", *SMALL, "--tag", "x"]
+    planned = irl("plan", "table1", *ROW, "--store", copy, *common)
+    assert planned.code == 0 and f"{victim.id}/provenance.json was altered" in planned.err
+    # A store to copy from is only read.
+    away = irl("plan", "table1", *ROW, "--store", tmp_path / "none", "--from", copy, *common)
+    assert away.code == 0 and "provenance.json was altered" in away.err
+    done = report("table1", copy, *ROW)
+    error, hint = done.err.splitlines()[-2:]
+    assert done.code == 4 and victim.id in error
+    assert irl(*shlex.split(hint.split("`")[1])[1:]).code == 4
+    assert report("table1", copy, *ROW).code == 0
 
 
 def test_one_seed_has_no_p_value(report, table_store):

@@ -160,6 +160,18 @@ def test_two_tables_do_not_give_two_results_one_name(tables, tmp_path):
             "see",
         ),
         ('"Mine"', '"Mine"\nsettings = "none.toml"', "none.toml is not a file", "relative"),
+        (
+            "[mine]",
+            '[smoke]\nsettings = "experiments.toml"',
+            "'smoke' cannot be the name",
+            "another",
+        ),
+        (
+            "[mine]",
+            '[x-paper]\nsettings = "experiments.toml"',
+            "of --profile paper",
+            "another name",
+        ),
         ("[mine]", "mine", "is not valid TOML", "example"),
         ("[defaults]", "mine = 3\n[defaults]", "is not valid TOML", "example"),
     ],

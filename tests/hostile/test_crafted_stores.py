@@ -12,6 +12,7 @@ from chains import CHAIN, GRIDWORLD, SMOKE, assert_refused
 from irlcli.data.tensors import restore, to_bytes
 from irlcli.experiments import provenance
 from irlcli.experiments.circumstances import circumstances
+from irlcli.experiments.facts import left_out
 from irlcli.stages import train_maxent, transfer
 from irlcli.stages.base import Stage
 from irlcli.store import KeyRecord, Store
@@ -309,6 +310,23 @@ def test_a_provenance_of_another_form_is_named(irl, empty_store, origin):
     for command in ("lineage", "show"):
         done = irl(command, made.id, "--store", empty_store.root)
         assert_refused((done.code, done.out, done.err), 4, "provenance.json")
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"agent": ["x"]},
+        {"noise": {"a": []}},
+        {"settings": [["x"], 3]},
+        {"environment": {"name": []}},
+        {"airl": {"learner": []}},
+        {"setting": {}},
+    ],
+)
+def test_artefacts_of_another_form_have_no_part_in_a_report(empty_store, publish, parameters):
+    publish(empty_store, stage="evaluate", parameters=parameters)
+    wanted = [KeyRecord("evaluate", 1, {"agent": "idle", "settings": ["mass=2x"]}, {})]
+    assert left_out(empty_store.artefacts(), wanted, set()) == []
 
 
 def test_an_evaluation_that_was_made_from_itself_has_its_own_circumstances(empty_store, publish):

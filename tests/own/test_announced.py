@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from importlib.machinery import EXTENSION_SUFFIXES
 
 import pytest
 
@@ -127,6 +128,17 @@ def test_every_python_file_of_a_package_is_its_code(lab):
     assert digest(lab, "lab_parts.arm") == before
     (lab / "lab_parts" / "unused.py").write_text("")
     assert digest(lab, "lab_parts") != before
+
+
+@pytest.mark.parametrize("name", ["lab_env", "lab_physics", "lab_parts/arm"])
+def test_compiled_modules_are_code(lab, name):
+    """As the module itself, beside it, or in a package."""
+    compiled = lab / f"{name}{EXTENSION_SUFFIXES[0]}"
+    (lab / f"{name}.py").rename(compiled)
+    before = digest(lab)
+    assert before is not None
+    compiled.write_bytes(b"built again")
+    assert digest(lab) != before
 
 
 @pytest.mark.parametrize("name", ["lab_env", "lab_physics"])

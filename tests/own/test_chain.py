@@ -100,6 +100,10 @@ def test_the_chain_needs_the_file_only_once(bench):
     assert unknown.code == 4 and "unknown environment 'cart'" in unknown.err
     assert "--env" in unknown.err
     assert status(bench, *foreign, "--env", "cart.toml") == "HIT"
+    export = ("export", "reward", "copied.pt", "--to", "torch-export:copied.pt2")
+    assert bench.irl(*export).code == 4
+    exported = bench.irl(*export, "--env", "cart.toml")
+    assert exported.code == 0 and (bench.directory / "copied.pt2").exists(), exported.err
     # Other code is named, and refused unless the user names the file.
     bench.edit(bench.module, "0.1 * self.speed", "0.2 * self.speed")
     other = bench.irl(*again)

@@ -117,7 +117,17 @@ WRONG = [
         "'ant' is the name of another",
         "name",
     ),
+    # Of settings/control.toml, which belongs to no environment.
+    (
+        'id = "cart:Cart-v0"',
+        'id = "cart:Cart-v0"\nname = "control"',
+        2,
+        "'control' is the name of another",
+        "name",
+    ),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nname = "a b"', 2, "'a b'", "letters"),
+    ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["**.xml"]', 2, "'**.xml'", "*.xml"),
+    ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["."]', 2, "'.'", "*.xml"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["x.xml"]', 3, "'x.xml'", "relative"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfiles = ["../x"]', 2, "'../x'", "below"),
     ("[env]", "[env]\nsymmetries = 1", 2, "env.symmetries", "own-environments"),

@@ -141,11 +141,15 @@ def _text(name: pa.Scalar) -> str:
     return str(name.as_py() if narrow is None else narrow(name.as_py()))
 
 
+_TEXTS = (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view)
+
+
 def _check_settings(column: pa.Array, expected: Expected, place: Locate) -> None:
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
-        for name in pc.unique(column).to_pylist():
-            row = pc.index(column.cast(kind), name).as_py() if name is not None else 0
+    if any(is_text(kind) for is_text in _TEXTS):
+        names = column.cast(pa.large_string())
+        for name in pc.unique(names).to_pylist():
+            row = pc.index(names, name).as_py() if name is not None else 0
             expected.contradicts(name, place(row))
 
 
