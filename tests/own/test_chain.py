@@ -215,6 +215,11 @@ def test_the_experts_table_has_rows_of_own_environments(bench):
     assert {f"smoke.cart.{step}" for step in wanted} <= names
     assert all(name.startswith("smoke.cart.") for name in names)
     assert bench.irl(*plan, "--rows", "carts").code == 2
+    # A value that is written with an exponent is part of a name as well.
+    bench.edit(bench.toml, "high = 10.0", "high = 1e20")
+    bench.edit(bench.toml, 'ood = ["4x"]', 'ood = ["1e16x"]')
+    large = bench.irl(*plan, "--rows", "cart.toml.mass")
+    assert large.code == 0 and "smoke.cart.mass.expert.1e16x" in large.out, large.err
 
 
 def test_planning_and_hits_load_nothing_heavy(bench):

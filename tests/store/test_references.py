@@ -35,6 +35,22 @@ def test_prefixes_of_at_least_three_digits(empty_store, artefact, digits):
     assert (inside.artefact, inside.output) == (artefact, "reward.pt")
 
 
+def test_a_store_that_another_process_creates_meanwhile_is_a_store(tmp_path, monkeypatch):
+    """Between the look for its marker and the look for other files."""
+    root = tmp_path / "runs"
+    root.mkdir()
+    listed = Path.iterdir
+
+    def meanwhile(path):
+        monkeypatch.undo()
+        Store(root).create()
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", meanwhile)
+    Store(root).create()
+    assert (root / "STORE").is_file()
+
+
 @pytest.mark.parametrize("digits", [0, 1, 2])
 def test_shorter_prefixes_name_nothing(empty_store, artefact, digits):
     with pytest.raises(NotFound):
