@@ -109,7 +109,7 @@ def _further(files: Sequence[str], root: Path, where: str) -> Iterator[Path]:
             )
         try:
             matching = sorted(path for path in root.glob(pattern) if path.is_file())
-        except (ValueError, IndexError, NotImplementedError):
+        except (ValueError, IndexError):
             raise UsageError(
                 f"{where}: env.files: {pattern!r} is not a pattern of files",
                 "write for example assets/*.xml, or **/*.xml for any depth",

@@ -129,12 +129,10 @@ def _read(path: Path) -> Record | None:
     """The jobs that were submitted together; None if the file cannot be read."""
     try:
         value = json.loads(path.read_bytes())
-        if value["schema"] == _SCHEMA:
-            jobs = [Submitted(**job) for job in value["jobs"]]
-            return Record(path.parent, value["place"], jobs)
+        jobs = [Submitted(**job) for job in value["jobs"]]
+        return Record(path.parent, value["place"], jobs) if value["schema"] == _SCHEMA else None
     except (OSError, ValueError, KeyError, TypeError):
-        pass
-    return None
+        return None
 
 
 def ended(
