@@ -196,9 +196,10 @@ def return_distance(members: Sequence[Member]) -> float | None:
 def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -> Judgement:
     """Why a retrained policy does not earn what the expert earns, if it does not.
 
-    No verdict (None) where the expert earns no more than the random agent. ``retrained``: its regret is within 10 % of what the expert earns above the random agent.
-    ``wrong reward``: its learned return is at least the expert's. ``optimisation fell short``: the
-    expert's learned return is higher, so the reward still offers more.
+    None where the expert earns no more than the random agent. ``retrained``: its regret is within
+    10 % of what the expert earns above the random agent. ``wrong reward``: its learned return is at
+    least the expert's. ``optimisation fell short``: the expert's learned return is higher, so the
+    reward still offers more.
 
     Args:
         policy, expert, random: true returns.
