@@ -148,7 +148,8 @@ def test_every_table_has_a_make_target_and_is_in_the_docs() -> None:
 
 
 @pytest.mark.parametrize("name", ["python-api.md", "environments.md"])
-def test_the_python_of_a_page_runs(name: str, tmp_path: Path) -> None:
+def test_the_python_of_a_page_runs(name: str, tmp_path: Path, store_copy: object) -> None:
+    """In the directory of a store that holds some of what the page makes."""
     code = "\n".join(blocks(CHECKOUT / "docs" / name, "python"))
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True

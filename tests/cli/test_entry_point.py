@@ -130,7 +130,8 @@ def test_interrupted_with_a_checkpoint(irl, tmp_path, number):
     Result.out = out
     assert_answered(Result, 130, "checkpoint")
     planned = irl(*line, "--dry-run")
-    assert planned.code == 0 and planned.out.startswith("RESUME")
+    assert planned.code == 0 and planned.out.startswith("RESUME  train-expert")
+    assert "BLOCKED collect-experts" in planned.out
 
 
 def test_a_closed_pipe_is_quiet(smoke_store):

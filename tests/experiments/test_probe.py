@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from types import SimpleNamespace
 
@@ -118,7 +119,7 @@ def test_a_store_that_cannot_be_written(probe):
 @pytest.mark.parametrize("seconds", [-3600, 3600])
 def test_clocks_that_differ(probe, seconds):
     (warning,) = probe(answer(time=time.time() + seconds))
-    assert "the clock of the node n1 differs by 36" in warning or "by 35" in warning
+    assert re.search(r"the clock of the node n1 differs by 3(60\d|59\d) s", warning)
 
 
 def test_a_disk_that_is_nearly_full(probe):

@@ -118,32 +118,8 @@ def irl(*arguments):
     return [sys.executable, "-m", "irlcli", *arguments]
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_exit_130(tmp_path):
-    arguments = ["collect-experts", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
-    arguments += ["--profile", "smoke", "--set", "expert.total_steps=200000"]
-    arguments += ["--store", str(tmp_path / "runs")]
-    process = subprocess.Popen(
-        irl(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    for line in process.stderr:
-        # The second report: at least one round is done, a million steps are not.
-        if "steps/s" in line or "/200," in line:
-            break
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 130
-    assert output == ""
-    assert "checkpoint was written" in errors and "hint:" in errors
-    assert "Traceback" not in errors
-    plan = subprocess.run(
-        irl(*arguments, "--dry-run"), capture_output=True, text=True, check=True
-    ).stdout
-    assert plan.startswith("RESUME  train-expert")
-    assert "BLOCKED collect-experts" in plan
-
-
-def interrupted(arguments, count, gap=0.05):
-    """Exit code and stderr of a command that gets ``count`` SIGINTs once it is at work."""
+def interrupted(arguments):
+    """Exit code and stderr of a command that gets SIGINTs from when it is at work until it ends."""
     process = subprocess.Popen(
         irl(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -151,19 +127,18 @@ def interrupted(arguments, count, gap=0.05):
     while not line.startswith("RUN"):
         line = process.stderr.readline()
     time.sleep(3.0)  # past the imports, into the episodes
-    for _ in range(count):
+    while process.poll() is None:
         process.send_signal(signal.SIGINT)
-        time.sleep(gap)
+        time.sleep(0.002)
     _, errors = process.communicate(timeout=400)
     return process.returncode, errors
 
 
-@pytest.mark.parametrize(("count", "gap"), [(1, 0.05), (2000, 0.002)])
-def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path, count, gap):
-    """Also while a key is held down: signals during the exit change nothing."""
+def test_a_stage_without_rounds_answers_ctrl_c_too(tmp_path):
+    """While a key is held down: signals during the exit change nothing."""
     arguments = ["evaluate", "--random", "--env", "lunar-lander", "--intervention", "bounce=0.9"]
     arguments += ["--episodes", "1500", "--store", str(tmp_path / "runs")]
-    code, errors = interrupted(arguments, count, gap)
+    code, errors = interrupted(arguments)
     assert code == 130
     assert "error:" in errors and "hint:" in errors and "Traceback" not in errors
 

@@ -38,8 +38,8 @@ def test_kills_failing_calls_and_changed_clocks():
 def test_many_processes_beside_gc_and_verify():
     found = short("concurrency")
     assert (
-        found["requests"] == 800
-        and found["artefacts made or copied"] >= found["artefacts at the end"]
+        found["artefacts made or copied"] >= found["artefacts at the end"] > 0
+        and found["artefacts collected"] > 0
     )
 
 
