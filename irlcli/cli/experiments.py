@@ -16,7 +16,7 @@ from irlcli.cli.options import Out, planning_command, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
-from irlcli.requests.tables import TableChoice, check_tag, open_plan, steps_of
+from irlcli.requests.tables import TableChoice, check_tag, open_plan, steps_of, warn_of_damage
 
 if TYPE_CHECKING:
     from irlcli.experiments.execute import Outcome
@@ -238,6 +238,7 @@ def run(
         if only is not None:
             _make_one(session, runner, plan, only)
             return
+        warn_of_damage(plan, session.console.warn)
         if cluster is None:
             outcome = _make_all(session, runner, plan, choice, jobs or 1)
         else:

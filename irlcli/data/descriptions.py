@@ -356,8 +356,10 @@ class PenaltyChoice(Struct, frozen=True, kw_only=True):
             raise ValueError(f"it chose {self.chosen:g}, which is no candidate")
 
     def __str__(self) -> str:
-        tied = f", tied with {self.ties - 1} more: the smallest is taken" if self.ties > 1 else ""
-        return f"lambda {self.chosen:g} was the best of {','.join(f'{w:g}' for w in self.weights)}{tied}"
+        tried = ",".join(f"{weight:g}" for weight in self.weights)
+        if self.ties > 1:
+            return f"lambda {self.chosen:g} is the smallest of {self.ties} equally good ones of {tried}"
+        return f"lambda {self.chosen:g} was the best of {tried}"
 
 
 class SettingSummary(Struct, frozen=True, kw_only=True):

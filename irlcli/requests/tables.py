@@ -212,6 +212,12 @@ def steps_of(plan: "Plan", warn: Callable[[str], None]) -> list[dict[str, Any]]:
     return documents
 
 
+def warn_of_damage(plan: "Plan", warn: Callable[[str], None]) -> None:
+    """Tell ``warn`` of artefacts whose provenance is damaged: the report would fail, after all steps."""
+    for name in plan.tasks:
+        _other_versions(plan.step(name), warn)
+
+
 def _other_versions(step: "Step", warn: Callable[[str], None]) -> list[str]:
     from irlcli.experiments import provenance
 

