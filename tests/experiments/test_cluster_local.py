@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 from test_run import REWARDS, ROW, Runs, alive
 
+from irlcli.experiments.cluster.local import Local
 from irlcli.experiments.cluster.records import Submitted, ended, new_record
 from irlcli.store import Store
 
@@ -55,6 +57,24 @@ def test_the_log_of_a_job_ends_in_how_far_it_is(tmp_path):
     log = record.logs / "7_0_log.err"
     log.write_text("RUN expert\n" + "x" * 5000 + "\n  expert: 512/1,024 steps\n")
     assert record.last_line("7") == "  expert: 512/1,024 steps"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_another_run_sees_a_job_from_its_start_to_its_end(tmp_path):
+    """A process has no command line in /proc for a moment after its start."""
+    store = Store(tmp_path)
+    store.create()
+    queue = Local(store, None)
+    for _ in range(20):
+        record = new_record(store, queue.place)
+        line = [sys.executable, "-S", "-c", "import sys; sys.stdin.read()", "submitit.local"]
+        process = subprocess.Popen(line, stdin=subprocess.PIPE)
+        record.add([Submitted("step", "identity", str(process.pid))])
+        assert str(process.pid) in queue.states()
+        process.stdin.close()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert queue.states() == {}
+        process.wait()
 
 
 def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path, monkeypatch):

@@ -58,9 +58,12 @@ class Local:
     def _runs(self, job: str) -> bool:
         if job in self._jobs:
             return self._jobs[job].state == "RUNNING"
+        process = Path("/proc", job)
         try:
-            # Another process may have the id by now.
-            return b"submitit.local" in Path(f"/proc/{job}/cmdline").read_bytes()
+            words = (process / "cmdline").read_bytes()
+            # Another process may have the id by now. One that just started has no words yet; one
+            # that has ended has none left, and no program.
+            return b"submitit.local" in words or (not words and (process / "exe").exists())
         except OSError:
             return False
 
