@@ -115,11 +115,16 @@ def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) 
     learned = added(parse_setting(env, trained[0])) if trained else []
     for setting in wanted:
         if added(setting) != learned:
-            fit = [name for name, knob in known.items() if knob.observed in (learned or [""])]
+            fit = [
+                " or ".join(name for name, knob in known.items() if knob.observed == what)
+                for what in learned or [""]
+            ]
             raise UsageError(
                 f"{env} {setting} and {', '.join(trained)} have different observations: the first "
                 f"are {_observations(added(setting))}, the second {_observations(learned)}",
-                f"name a setting of {', '.join(fit)}" if fit else "name the setting default",
+                f"name a setting of {', together with '.join(fit)}"
+                if all(fit)
+                else "name the setting default",
             )
 
 

@@ -467,5 +467,12 @@ def test_a_goal_or_cue_that_the_policy_cannot_see_is_refused(trained, wanted, fi
         return
     with pytest.raises(UsageError, match="different observations") as caught:
         check_observed("half-cheetah", [trained], places)
-    alike = {"goal-y=0": "goal-y, direction", "cue-strength=0.8": "cue-strength"}
-    assert caught.value.hint.endswith(alike.get(trained, "mass, friction, leg-length"))
+    alike = {"goal-y=0": "goal-y or direction", "cue-strength=0.8": "cue-strength"}
+    assert caught.value.hint.endswith(alike.get(trained, "mass or friction or leg-length"))
+
+
+def test_the_hint_names_all_that_must_be_observed():
+    trained, wanted = "cue-strength=0.9,goal-y=3", parse_setting("half-cheetah", "goal-y=8")
+    with pytest.raises(UsageError) as caught:
+        check_observed("half-cheetah", [trained], [wanted])
+    assert caught.value.hint.endswith("cue-strength, together with goal-y or direction")

@@ -19,7 +19,7 @@ import pytest
 from msgspec.structs import replace
 
 from irlcli import stages
-from irlcli.configs import Config, InterventionConfig
+from irlcli.configs import Config, InterventionConfig, load_config
 from irlcli.configs.relevance import relevant_airl, relevant_maxent
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
@@ -240,8 +240,8 @@ UNREAD_AIRL = [
 ]
 # What a stage does not read, whatever the other fields are.
 UNREAD = {
-    # The bar is for the report of the experts.
-    "": ["expert.bar"],
+    # The bar is for the report of the experts; no episode of this environment terminates.
+    "": ["expert.bar", "airl.fixed_horizon"],
     "train-airl": UNREAD_AIRL,
     "transfer": UNREAD_AIRL,
     "transfer by SAC": UNREAD_AIRL,
@@ -485,6 +485,27 @@ def test_fields_without_influence_do_not_change_the_key(request_, changes, field
     for path in fields:
         changed = with_field(config, path, another(path, field_of(config, path)))
         assert changed != config and key(request_(changed)) == key(request_(config)), path
+
+
+@pytest.mark.parametrize(
+    ("env", "setting", "reads"),
+    [
+        ("half-cheetah", "mass=2x", False),
+        ("mujoco-half-cheetah", "mass=2x", False),
+        ("mujoco-hopper", "mass=2x", True),
+        ("lunar-lander", "bounce=0.5", True),
+    ],
+)
+def test_absorbing_states_are_in_the_key_where_episodes_terminate(env, setting, reads):
+    settings = parse_settings(env, setting)
+    keys = set()
+    for fixed in (True, False):
+        config = load_config(
+            env, profile="smoke", overrides=[f"airl.fixed_horizon={fixed}".lower()]
+        )
+        demonstrations = From(collect_experts.request(env, settings, config, 0))
+        keys.add(key(train_airl.request(demonstrations, env, settings, config.airl, 0)))
+    assert len(keys) == 1 + reads
 
 
 def test_gail_has_one_logit_and_one_reward():

@@ -87,7 +87,7 @@ def test_walkers_go_through_the_chain(tmp_path, irl, env, intervention, ood):
         for done in refused:
             assert done.code == 2
             assert "half-cheetah mass=2x" in done.err and "different observations" in done.err
-            assert "hint: name a setting of goal-y, direction" in done.err
+            assert "hint: name a setting of goal-y or direction" in done.err
             assert "RUN" not in done.err
 
 

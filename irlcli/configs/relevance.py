@@ -102,8 +102,13 @@ def check_actions(actions: str, discrete_actions: bool) -> None:
         raise UsageError(f"airl.actions = {actions} needs continuous actions", "omit airl.actions")
 
 
-def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
+def relevant_airl(airl: AIRLConfig, discrete_actions: bool, terminates: bool = True) -> AIRLConfig:
     """``airl`` with every field reset that its method, replay, selection and actions do not use.
+
+    Args:
+        airl: as configured.
+        discrete_actions: of the environment.
+        terminates: whether an episode of the environment may end before the time limit.
 
     Raises:
         UsageError: an unknown learner or penalty, options that contradict each other or do not fit the
@@ -113,6 +118,8 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     check_penalty(airl.penalty, "airl")
     airl = replace(airl, **LEARNERS[airl.learner].fixes)
     check_actions(airl.actions, discrete_actions)
+    if not terminates:
+        airl = replace(airl, fixed_horizon=_AIRL.fixed_horizon)
     airl = _penalty(airl)
     airl = _network(airl)
     airl = _kept_rounds(airl)

@@ -121,6 +121,7 @@ class EnvironmentSpec(NamedTuple):
         max_episode_steps: time limit [steps].
         knobs: the mechanisms that can be intervened on, by name.
         discrete_actions: whether an action is an index (otherwise a vector).
+        terminates: whether an episode may end before the time limit.
         tabular: whether the environment is solved exactly: experts come from value iteration
             and rewards from ``train-maxent``.
         physics: version of the dynamics and the true reward. It is part of every key: increase
@@ -141,6 +142,7 @@ class EnvironmentSpec(NamedTuple):
     max_episode_steps: int
     knobs: dict[str, Knob]
     discrete_actions: bool = False
+    terminates: bool = True
     tabular: bool = False
     physics: int = 1
     transition_reward: str | None = None

@@ -98,7 +98,7 @@ def _relevant(airl: AIRLConfig, env: str, trained: int) -> AIRLConfig:
     spec = environment(env)
     if airl.symmetries is True and spec.symmetries is None:
         raise UsageError(f"airl.symmetries: {env} has no symmetries", "--set airl.symmetries=none")
-    relevant = relevant_airl(airl, spec.discrete_actions)
+    relevant = relevant_airl(airl, spec.discrete_actions, spec.terminates)
     _check_rounds(relevant)
     if trained == 1:
         relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from irlcli.configs import PROFILES, Config, PPOConfig, load_config
 from irlcli.configs.relevance import relevant_airl, relevant_ppo, relevant_transfer
@@ -120,9 +121,9 @@ def test_a_layer_changes_only_what_it_names(toml):
     before = load_config("reacher", "paper")
     after = load_config("reacher", "paper", [toml("[airl.ppo]\nn_envs = 3")])
     assert after.airl.ppo.n_envs == 3
-    restored = msgspec.structs.replace(after.airl.ppo, n_envs=before.airl.ppo.n_envs)
-    airl = msgspec.structs.replace(after.airl, ppo=restored)
-    assert msgspec.structs.replace(after, airl=airl) == before
+    restored = replace(after.airl.ppo, n_envs=before.airl.ppo.n_envs)
+    airl = replace(after.airl, ppo=restored)
+    assert replace(after, airl=airl) == before
 
 
 def test_a_knob_has_experts_of_its_own(toml):
@@ -138,8 +139,8 @@ def test_a_knob_has_experts_of_its_own(toml):
     )
     assert power == config.expert and not power.ppo.use_sde
     assert (power.ppo.n_epochs, power.ppo.gamma) == (3, 0.25)
-    changed = msgspec.structs.replace(config.expert.ppo, n_epochs=7, use_sde=True)
-    assert bounce == msgspec.structs.replace(config.expert, ppo=changed)
+    changed = replace(config.expert.ppo, n_epochs=7, use_sde=True)
+    assert bounce == replace(config.expert, ppo=changed)
     later = load_config(LANDER, "smoke", [mine], ["expert.ppo.n_epochs=9"])
     assert later.expert_of(parse_settings(LANDER, "bounce=0.1")[0]).ppo.n_epochs == 9
 
@@ -476,13 +477,13 @@ def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
     )
     config = load_config("ant")
     constant = {"learning_rate_schedule": "constant"}
-    retrained = msgspec.structs.replace(config.transfer_of(legs).ppo, **constant)
+    retrained = replace(config.transfer_of(legs).ppo, **constant)
     assert config.airl_of([legs]).challenger.ppo == retrained
     assert config.airl_of([friction]).challenger.ppo == config.transfer_of(friction).ppo
     # Without a reward learning of its own, nothing else differs.
     smoke = load_config("ant", profile="smoke")
     own = smoke.airl_of([legs]).challenger
-    assert smoke.airl_of([legs]) == msgspec.structs.replace(smoke.airl, challenger=own)
+    assert smoke.airl_of([legs]) == replace(smoke.airl, challenger=own)
     # Two whole generations of challengers, and a mean that has as many rounds as it asks for.
     for setting in (friction, legs):
         airl = relevant_airl(config.airl_of([setting]), discrete_actions=False)
@@ -494,6 +495,27 @@ def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
     assert own.airl_of([legs]).challenger.ppo.activation == "relu"
 
 
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_challengers_at_most_double_the_cost_of_learning(env):
+    """In steps and in updates a round, where there are challengers."""
+    config = load_config(env)
+    for knob, listed in config.interventions.items():
+        settings = [parse_settings(env, f"{knob}={value}")[0] for value in listed.id]
+        airl = config.airl_of(settings)
+        if airl.challenger.life:
+            student, ppo = airl.ppo, replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
+            assert _steps(ppo) <= 2 * _steps(student)
+            assert _updates(ppo) <= 2 * _updates(student)
+
+
+def _steps(ppo):
+    return ppo.n_envs * ppo.n_steps * ppo.rollouts_per_round
+
+
+def _updates(ppo):
+    return ppo.n_epochs * _steps(ppo) / min(ppo.batch_size, ppo.n_envs * ppo.n_steps)
+
+
 def test_a_knob_has_rewards_of_its_own(toml):
     mine = toml("[interventions.bounce.airl]\nbatch_size = 64\n[airl]\nbc_epochs = 7")
     config = load_config(LANDER, files=[mine], overrides=["airl.hidden=[8]"])
@@ -501,7 +523,7 @@ def test_a_knob_has_rewards_of_its_own(toml):
         config.airl_of(parse_settings(LANDER, text)) for text in ("bounce=0.1", "engine-power=1x")
     )
     assert power == config.airl and (power.bc_epochs, power.hidden) == (7, (8,))
-    assert bounce == msgspec.structs.replace(power, batch_size=64)
+    assert bounce == replace(power, batch_size=64)
 
 
 def test_retrained_policies_and_challengers_learn_as_experts_do_unless_the_config_differs():
@@ -510,9 +532,7 @@ def test_retrained_policies_and_challengers_learn_as_experts_do_unless_the_confi
     # A knob's own experts, here with gSDE.
     legs = parse_settings("ant", "leg-length=2x")
     falling = {"learning_rate_schedule": "linear"}
-    assert config.transfer_of(legs[0]).ppo == msgspec.structs.replace(
-        config.expert_of(legs[0]).ppo, **falling
-    )
+    assert config.transfer_of(legs[0]).ppo == replace(config.expert_of(legs[0]).ppo, **falling)
     assert config.airl_of(legs).challenger.ppo == config.expert_of(legs[0]).ppo
     assert config.expert_of(legs[0]).ppo.use_sde and not config.transfer.ppo.use_sde
     config = load_config("ant", overrides=["expert.ppo.n_epochs=3", "transfer.ppo.n_epochs=5"])
@@ -540,16 +560,16 @@ def test_retraining_is_as_strong_as_the_experts_training(env):
                 own |= {"gamma": 0.99, "learning_rate_schedule": "linear"}
             if (env, knob) == ("ant", "leg-length"):
                 own |= {"learning_rate_schedule": "linear"}
-            assert transfer.ppo == msgspec.structs.replace(expert.ppo, **own)
+            assert transfer.ppo == replace(expert.ppo, **own)
 
 
 def test_a_training_without_an_update_is_refused():
     relevant = partial(relevant_transfer, discrete_actions=False, from_student=False)
     sac = TransferConfig(algorithm="sac", total_steps=1000, sac=SACConfig(n_envs=2, n_steps=100))
-    begins = [msgspec.structs.replace(sac.sac, learning_starts=n) for n in (999, 1000)]
-    assert relevant(msgspec.structs.replace(sac, sac=begins[0])).sac == begins[0]
+    begins = [replace(sac.sac, learning_starts=n) for n in (999, 1000)]
+    assert relevant(replace(sac, sac=begins[0])).sac == begins[0]
     with pytest.raises(UsageError, match="leaves no update: training has 1000 steps"):
-        relevant(msgspec.structs.replace(sac, sac=begins[1]))
+        relevant(replace(sac, sac=begins[1]))
     with pytest.raises(UsageError, match=r"transfer\.ppo: one world and one step"):
         relevant(TransferConfig(ppo=PPOConfig(n_envs=1, n_steps=1)))
 
@@ -574,7 +594,7 @@ def test_none_unsets_a_field_that_the_settings_set(toml):
         {"files": [toml('[airl]\naveraged_rounds = "none"')]},
     ):
         found = load_config("ant", **source).airl_of([friction])
-        assert found == msgspec.structs.replace(listed, averaged_rounds=msgspec.UNSET)
+        assert found == replace(listed, averaged_rounds=msgspec.UNSET)
     with pytest.raises(UsageError, match="expected a whole number"):
         load_config("ant", overrides=["airl.averaged_rounds=some"])
 
@@ -600,7 +620,7 @@ def test_none_unsets_what_another_section_would_pass_on():
     inherited = load_config(LANDER, "paper").transfer.ppo
     assert inherited.adam_eps == 1e-5
     plain = load_config(LANDER, "paper", overrides=["transfer.ppo.adam_eps=none"])
-    assert plain.transfer.ppo == msgspec.structs.replace(inherited, adam_eps=msgspec.UNSET)
+    assert plain.transfer.ppo == replace(inherited, adam_eps=msgspec.UNSET)
     assert plain.expert.ppo.adam_eps == 1e-5
     challenger = ["airl.challenger.ppo.adam_eps=none"]
     found = load_config(LANDER, "paper", overrides=challenger)

@@ -123,6 +123,9 @@ def test_a_fall_ends_the_episode_unless_told_otherwise(name):
         _, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
         assert not truncated and info["reward_survive"] == 0.0
         ends[terminates] = terminated
+        assert not env.is_healthy
+        env.reset(seed=0)
+        assert env.is_healthy
     assert ends == {0: False, 1: True}
 
 
@@ -179,6 +182,17 @@ def test_an_unstable_simulation_ends_the_episode_and_leaves_no_trace(
     np.testing.assert_array_equal(roll(env, 5, 20), expected)
     # MuJoCo would write a file here.
     assert not list(tmp_path.iterdir()) and capfd.readouterr() == ("", "")
+
+
+def test_a_robot_that_is_thrown_apart_earns_nothing_for_it(name):
+    """MuJoCo's own bound is 1e10; below it the speed forward would still be paid."""
+    env = ROBOTS[name]()
+    for speed, thrown in ((20.0, False), (1000.0, True)):
+        env.reset(seed=0)
+        env.data.qvel[0] = speed
+        _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
+        assert truncated == thrown == ("error" in info)
+        assert (reward == 0.0 and not terminated) if thrown else reward > 1.0
 
 
 def test_worlds_go_on_after_one_became_unstable():

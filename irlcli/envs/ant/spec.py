@@ -8,6 +8,7 @@ SPEC = EnvironmentSpec(
     entry_point="irlcli.envs.ant.env:Ant",
     gym_id="irlcli/Ant-v0",
     max_episode_steps=1000,
+    terminates=False,
     knobs={
         **WALKER_KNOBS,
         "leg-length": LEG_LENGTH._replace(description="length of the hind legs"),

@@ -8,6 +8,7 @@ SPEC = EnvironmentSpec(
     entry_point="irlcli.envs.half_cheetah.env:HalfCheetah",
     gym_id="irlcli/HalfCheetah-v0",
     max_episode_steps=1000,
+    terminates=False,
     knobs={
         **WALKER_KNOBS,
         "leg-length": LEG_LENGTH._replace(

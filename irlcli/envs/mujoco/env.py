@@ -26,6 +26,8 @@ from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
 from irlcli.errors import StageFailed, first_line
 
 _KNOBS = {knob.argument: knob for spec in MUJOCO_ROBOTS for knob in spec.knobs.values()}
+# What moves faster [m/s] is being thrown apart: MuJoCo itself warns only at 1e10.
+_FASTEST = 100.0
 _UNSTABLE = "the simulation is unstable: a position, speed or acceleration is huge or not a number"
 # MuJoCo counts its warnings by kind.
 _FIRST = int(mujoco.mjtWarning.mjWARN_BADQPOS)
@@ -38,7 +40,7 @@ class Robot(MujocoEnv, EzPickle):
     Observations are Gymnasium's, as float32. Actions are clipped to the motors' range and have
     double precision. ``info["progress"]`` is the distance [m] that the robot moved forward.
 
-    If the simulation becomes unstable, the episode is truncated: the step returns the last
+    If the simulation becomes unstable, or moves faster than 100 m/s, the episode is truncated: the step returns the last
     observation, reward 0 and ``info["error"]``.
 
     Args:
@@ -116,8 +118,9 @@ class Robot(MujocoEnv, EzPickle):
         action = clipped(action, self._low, self._high)
         state, reward, terminated, _, info = super().step(action)
         observation = state.astype(np.float32)
-        # MuJoCo itself starts again from the initial state then.
-        if any(self._warnings.tolist()) or not is_finite(observation):
+        exploded = abs(info["x_velocity"]) > _FASTEST or not is_finite(observation)
+        # With a warning MuJoCo itself starts again from the initial state.
+        if exploded or any(self._warnings.tolist()):
             return self._observation, 0.0, False, True, {"error": _UNSTABLE}
         info["progress"] = info["x_velocity"] * self.dt
         self._observation = observation
@@ -164,6 +167,11 @@ class Falling(Robot):
     def do_simulation(self, ctrl: np.ndarray, n_frames: int) -> None:
         self._healthy = None
         super().do_simulation(ctrl, n_frames)
+
+    def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Set positions and velocities, as a reset does."""
+        self._healthy = None
+        super().set_state(qpos, qvel)
 
     @property
     def is_healthy(self) -> bool:

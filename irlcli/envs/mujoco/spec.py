@@ -26,13 +26,18 @@ def _knobs(legs: str) -> dict[str, Knob]:
 
 
 def _spec(
-    name: str, robot: str, knobs: dict[str, Knob], symmetries: str | None = None
+    name: str,
+    robot: str,
+    knobs: dict[str, Knob],
+    terminates: bool,
+    symmetries: str | None = None,
 ) -> EnvironmentSpec:
     return EnvironmentSpec(
         name=name,
         entry_point=f"irlcli.envs.mujoco.env:{robot}",
         gym_id=f"irlcli/MuJoCo{robot}-v0",
         max_episode_steps=1000,
+        terminates=terminates,
         knobs=knobs,
         symmetries=symmetries,
         unobserved="the horizontal position of the robot",
@@ -50,12 +55,13 @@ def _falling(name: str, robot: str, legs: str, symmetries: str | None = None) ->
         "whether a fall ends the episode",
         whole=True,
     )
-    return _spec(name, robot, {**_knobs(legs), "terminate-when-unhealthy": ends}, symmetries)
+    knobs = {**_knobs(legs), "terminate-when-unhealthy": ends}
+    return _spec(name, robot, knobs, terminates=True, symmetries=symmetries)
 
 
 MUJOCO_ROBOTS = (
     _falling("mujoco-ant", "Ant", "the hind legs", "irlcli.envs.mujoco.symmetries:ant"),
-    _spec("mujoco-half-cheetah", "HalfCheetah", _knobs("both legs")),
+    _spec("mujoco-half-cheetah", "HalfCheetah", _knobs("both legs"), terminates=False),
     _falling("mujoco-hopper", "Hopper", "the leg"),
     _falling("mujoco-walker2d", "Walker2d", "both legs"),
     _falling("mujoco-humanoid", "Humanoid", "both legs"),

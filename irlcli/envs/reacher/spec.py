@@ -8,6 +8,7 @@ SPEC = EnvironmentSpec(
     entry_point="irlcli.envs.reacher.env:Reacher",
     gym_id="irlcli/Reacher-v0",
     max_episode_steps=150,
+    terminates=False,
     knobs={"gravity": Knob("gravity", ("multiplier",), 0.0, 20.0, "multiple of 9.8 m/s^2")},
     physics=2,
     needs=PYBULLET,
