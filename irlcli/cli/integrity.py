@@ -1,5 +1,6 @@
 """``irl verify`` and ``irl gc``: damaged and unused artefacts."""
 
+import shlex
 from typing import Annotated, Any
 
 import typer
@@ -77,7 +78,7 @@ def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> No
     if result["damaged_names"]:
         raise IntegrityError(
             f"damaged names: {', '.join(result['damaged_names'])}",
-            "name the artefacts again: `irl name REF NAME`",
+            f"name the artefacts again: `{_naming(session)}`",
             result,
         )
     missing = session.store.missing(index)
@@ -97,9 +98,13 @@ def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> No
             f"{len(names)} of {len(session.store.names())} names point to nothing: "
             f"{', '.join(names)}",
             "run the command that made the artefact again, with its --name if it had one; or give "
-            "the name to another artefact (irl name REF NAME)",
+            f"the name to another artefact (`{_naming(session)}`)",
             result,
         )
+
+
+def _naming(session: Session) -> str:
+    return shlex.join(["irl", "name", "REF", "NAME", *session.store.option])
 
 
 def _print_command(id16: str, command: str) -> None:

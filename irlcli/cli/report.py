@@ -76,9 +76,9 @@ def report(
         "--name": name,
     }
     if kind not in ("returns", "table2") and refs:
-        from irlcli.experiments.tables import load_table
+        from irlcli.experiments.tables import REPORTS, load_table
 
-        load_table(kind, file)
+        load_table(kind, file, REPORTS)
     if kind != "returns" and refs:
         raise UsageError(
             f"{kind} takes no references", "its results are found by their configuration"
@@ -124,7 +124,9 @@ def _table(
     session: StageSession, chosen: TableChoice, name: str | None, directory: Path | None
 ) -> None:
     """The report on a table of ``settings/experiments.toml``, from what exists."""
-    plan = open_plan(session, chosen)
+    from irlcli.experiments.tables import REPORTS
+
+    plan = open_plan(session, chosen, REPORTS)
     if directory is not None:
         check_out(directory, session.store.root, plan.table)
     request = report_of(session, chosen, plan)

@@ -151,6 +151,9 @@ def _share(
             f"{id16} is kept beside {holder}: the same request gave {holder} in {target.root}, and "
             "commands find that one"
         )
+    # One that was made from a damaged one was skipped.
+    there = {artefact.id for artefact in (*shared.copied, *shared.present)}
+    artefacts = [artefact for artefact in artefacts if artefact.id in there]
     where = f"{target.root}/"
     console.say(
         f"{out.counted(len(shared.copied), 'artefact')}, {shared.bytes:,} bytes copied to {target.root}; "

@@ -48,13 +48,17 @@ def report_of(session: StageSession, choice: TableChoice, plan: "Plan") -> "Requ
 
 
 def _named(session: StageSession, plan: "Plan") -> str:
-    """Which results of the table's steps have names in the store, for the hint."""
+    """Which results that the table reports have names in the store, for the hint."""
     tag = f"{plan.selection.tag}."
-    steps = {name.removeprefix(tag) for name in plan.tasks}
-    parts = [name.partition(".") for name in session.store.names()]
-    found = {first for first, _, rest in parts if rest in steps}
+    reported = {name.removeprefix(tag) for name, t in plan.tasks.items() if t.cell is not None}
+    there = set(session.store.ids())
+    named = [name for name, id16 in session.store.names().items() if id16 in there]
+    found = {first for first, _, rest in (n.partition(".") for n in named) if rest in reported}
     if plan.selection.tag in found:
         return "its results in the store have other keys: another config, or changed code. "
+    if plan.table.settings is not None:
+        # Its names are those of no profile.
+        return ""
     profiles = [f"--profile {name}" for name in PROFILES if name in found]
     return f"there are results of {' and '.join(profiles)}. " if profiles else ""
 

@@ -6,6 +6,7 @@ which is read without a tensor library. A foreign file has to be loaded.
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Literal, overload
 
@@ -59,7 +60,7 @@ def tensor_file(
     if artefact.manifest.record.stage == "clone" and kind == "reward":
         raise UsageError(
             f"{ref!r} is a behavioural clone, which learned no reward",
-            f"`irl evaluate --policy {ref}` measures its policy",
+            f"`{shlex.join(['irl', 'evaluate', '--policy', ref, *store.option])}` measures its policy",
         )
     output = resolved.output or _required(artefact, f"{kind}.pt")
     if output != f"{kind}.pt":
@@ -169,10 +170,9 @@ def demonstrations(store: Store, ref: str) -> tuple[Source, str, list[str]]:
         if not any((Path(ref) / name).exists() for name in (EPISODES, STEPS)):
             hint = f"name an artefact, or a directory of demonstrations; {store.listing}"
             if Path(ref).is_file():
-                hint = (
-                    f"`irl import {ref} --env ENV --intervention KNOB=VALUE` turns a recording into "
-                    "demonstrations"
-                )
+                words = ["irl", "import", ref, "--env", "ENV", "--intervention", "KNOB=VALUE"]
+                line = shlex.join([*words, *store.option])
+                hint = f"`{line}` turns a recording into demonstrations"
             raise NotFound(f"{ref!r} is neither an artefact nor a directory with {EPISODES}", hint)
         demos = read_demonstrations(Path(ref))
         return foreign_source(resolved.path), demos.env, list(demos.trajectories)

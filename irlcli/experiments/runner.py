@@ -201,6 +201,7 @@ class Runner:
         from irlcli.experiments.checkpoints import StageCheckpoints
 
         inputs = {role: self._checked(source) for role, source in sources.items()}
+        scratch.inputs = [source.sha256 for source in sources.values()]
         checkpoints = StageCheckpoints(
             request.stage, scratch, self.console, self.checkpoint_seconds
         )

@@ -1,7 +1,7 @@
 """The tables and figures of ``settings/experiments.toml``: rows, methods, seeds and measures."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -15,11 +15,11 @@ from irlcli.envs.announced import announced
 from irlcli.envs.registry import ENVIRONMENTS, environment, is_known, resolve
 from irlcli.envs.spec import EnvironmentSpec
 from irlcli.errors import NotFound, UsageError, closest, suggest
-from irlcli.experiments.variants import read_variants
+from irlcli.experiments.variants import read_variants, step_name
 from irlcli.interventions import knob_of
 from irlcli.methods import METHODS
 from irlcli.report.agents import RETRAINED
-from irlcli.report.parameters import ASSESS, CUE, Variant
+from irlcli.report.parameters import ASSESS, CUE, PARTS, Variant, has_held_out
 
 Kind = Literal["comparison", "experts", "figure2", "control"]
 Measure = Literal["transfer", "from-student", "zero-shot", "transfer-id", "id", "assess", "cue"]
@@ -145,24 +145,34 @@ def check_names(tables: Iterable[Table]) -> None:
     for table in tables:
         if table.settings is not None:
             continue
-        changed: dict[str, Any] = {m: table.penalty_weights.get(m) for m in table.methods}
-        if table.variants:
-            changed = {v.name: (table.methods, v.overrides) for v in table.variants}
         for row in table.rows:
-            for name, config in changed.items():
+            for name, config, differs, hint in _identified(table):
                 other, same = first.setdefault((row, name), (table.name, config))
                 if same != config:
-                    what = "other overrides" if table.variants else "another lambda"
                     raise UsageError(
-                        f"{table.name!r} has {name} in {row} with {what} than {other!r}, so different "
-                        "results would have one name",
-                        f"write settings = FILE in [{table.name}], or "
-                        + ("rename the variant" if table.variants else "omit penalty_weights"),
+                        f"{table.name!r} has {name} in {row} with {differs} than {other!r}, so "
+                        "different results would have one name",
+                        f"write settings = FILE in [{table.name}], or {hint}",
                     )
 
 
-def load_table(name: str, path: Path | None = None) -> Table:
-    """The table called ``name``.
+def _identified(table: Table) -> Iterator[tuple[str, Any, str, str]]:
+    """Parts of the names of steps: what their results depend on, the difference in words, a hint."""
+    names: dict[str, Any] = {m: table.penalty_weights.get(m) for m in table.methods}
+    words = "another lambda", "omit penalty_weights"
+    if table.variants:
+        names = {f"{step_name(v)}.{m}": v.overrides for v in table.variants for m in table.methods}
+        words = "other overrides", "rename the variant"
+    retrained = {measure for measure in RETRAINED if measure in table.measures}
+    bank = has_held_out(table.measures), retrained, table.retrainings if retrained else 0
+    for name, config in names.items():
+        yield name, config, *words
+        if ASSESS in table.measures:
+            yield f"{name}.assess", bank, "a bank of other policies", "list the same measures"
+
+
+def load_table(name: str, path: Path | None = None, others: Iterable[str] = ()) -> Table:
+    """The table called ``name``; ``others`` are what the command takes in place of a table.
 
     Raises:
         UsageError: no table has that name; or as :func:`load_tables`.
@@ -171,7 +181,7 @@ def load_table(name: str, path: Path | None = None) -> Table:
     if name in REPORTS:
         raise UsageError(f"{name} has no steps", f"`irl report {name}` prints it")
     if name not in tables:
-        raise UsageError(f"unknown table {name!r}", suggest(name, [*REPORTS, *tables]))
+        raise UsageError(f"unknown table {name!r}", suggest(name, [*others, *tables]))
     table = tables[name]
     if table.kind == "experts":
         return msgspec.structs.replace(table, rows=_rows_of(*ENVIRONMENTS.values()))
@@ -245,6 +255,10 @@ def _table(name: str, value: Any, defaults: _Defaults, directory: Path) -> Table
         )
     if name in REPORTS:
         raise UsageError(f"{name!r} is a report of its own", "give the table another name")
+    if name in PARTS:
+        raise UsageError(
+            f"{name!r} is a file of every table's report", "give the table another name"
+        )
     listed = converted(value, _Listed, name, _EXAMPLES)
     title = name if listed.title is UNSET else listed.title
     if not title.isprintable():

@@ -98,6 +98,8 @@ def between_retrainings(points: pd.DataFrame, row: str, agent: str, measure: str
     no reward was retrained twice in one setting.
     """
     chosen = points_of(points, row, agent, measure)
+    if not chosen["retraining"].any():
+        return None
     means = chosen.groupby(["seed", "setting", "retraining"])["true_return"].mean()
     variances = means.groupby(["seed", "setting"]).var().dropna()
     return float(np.sqrt(variances.mean())) if len(variances) else None
@@ -143,7 +145,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             low, high = s.interval or (None, None)
             progress = values["progress"].mean() if len(values) else math.nan
             # Baselines have one sample and no seed.
-            sampled = {None, *values.index}
+            sampled = {*values.index, *([None] if len(values) else [])}
             planned = p.cells_of(row.name, agent, measure)
             found.append(
                 {
@@ -171,6 +173,8 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
 def _with_imitation(p: Parameters, points: pd.DataFrame, table: pd.DataFrame) -> pd.DataFrame:
     """``table`` with the columns ``of_expert``, ``least_of_expert`` and ``imitated``."""
     whole = table[(table["agent"] == "expert") & (table["measure"] == "id") & table["complete"]]
+    rows = set(whole["row"])
+    experts_of = {row: _by_setting(points, row, "expert", "id") for row in rows}
     shares_of: list[tuple[float | None, float | None, bool | None]] = []
     for r in table.itertuples():
         is_student = r.agent in p.methods and r.measure == "id"
@@ -178,11 +182,10 @@ def _with_imitation(p: Parameters, points: pd.DataFrame, table: pd.DataFrame) ->
         compared = (
             r.measure in IN_DISTRIBUTION and r.agent != "expert" and (r.complete or is_student)
         )
-        earned = _by_setting(points, r.row, r.agent, r.measure)
-        if not compared or r.row not in set(whole["row"]) or earned.empty:
+        if not compared or r.row not in rows or not r.seeds:
             shares_of.append((None, None, None))
             continue
-        experts = _by_setting(points, r.row, "expert", "id")
+        earned, experts = _by_setting(points, r.row, r.agent, r.measure), experts_of[r.row]
         shares = (earned / experts).where(experts > 0)
         known = shares.notna().all()
         mean, least = (shares.mean(), shares.min()) if known else (None, None)

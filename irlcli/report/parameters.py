@@ -17,6 +17,8 @@ EXPERT_BY_REWARD = "expert by reward"
 ASSESS = "assess"
 # The measure of cells that hold no returns but how a learned reward depends on a cue.
 CUE = "cue"
+# The CSV files of a comparison, beside the one with the table's name.
+PARTS = ("seeds", "comparisons", "variants", "shares")
 
 
 def has_held_out(measures: Sequence[str]) -> bool:

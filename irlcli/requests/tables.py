@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -91,8 +91,10 @@ def check_tag(session: StageSession, choice: TableChoice, table: "Table") -> Non
             raise UsageError(error.message, f"add --tag NAME, or {error.hint}") from None
 
 
-def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
+def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] = ()) -> "Plan":
     """The plan of the chosen part of a table. The table's settings file becomes the session's.
+
+    ``others`` are what the command takes in place of a table.
 
     Raises:
         UsageError: an unknown table, row, method, phase or step, a lambda that the table lists
@@ -106,7 +108,7 @@ def open_plan(session: StageSession, choice: TableChoice) -> "Plan":
         raise UsageError("--only takes no --until", "omit --until: --only names one step")
     if choice.file is not None:
         check_path(choice.file, "--experiments")
-    table = load_table(choice.table, choice.file)
+    table = load_table(choice.table, choice.file, others)
     table = narrowed(
         table,
         None if choice.methods is None else _words(choice.methods),
@@ -226,5 +228,10 @@ def _other_versions(step: "Step", warn: Callable[[str], None]) -> list[str]:
     try:
         return provenance.other_versions(step.artefact.provenance())
     except IntegrityError as error:
-        warn(f"{error.message} ({error.hint})")
+        if step.status == "FOUND":
+            # It was read in a temporary directory if the store is behind a URL.
+            what = f"the provenance of {step.artefact.id} {step.why} is damaged"
+            warn(f"{what} (remove the artefact there, then compute or push it again)")
+        else:
+            warn(f"{error.message} ({error.hint})")
         return []

@@ -1,6 +1,7 @@
 """A published artefact: its directory, its manifest, and checks that change nothing."""
 
 import os
+import shlex
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -52,11 +53,10 @@ class Artefact(NamedTuple):
         try:
             return read_provenance(self.directory, self.manifest.id)
         except IntegrityError as error:
-            store = self.directory.parent
+            line = shlex.join(["irl", "verify", self.id, "--store", str(self.directory.parent)])
             raise IntegrityError(
                 error.message,
-                f"`irl verify {self.id} --store {store}` moves the artefact to quarantine and prints the "
-                "command that makes it again",
+                f"`{line}` moves the artefact to quarantine and prints the command that makes it again",
             ) from None
 
 

@@ -1,8 +1,10 @@
-"""Garbage collection: names and their ancestors are kept, and whatever is young."""
+"""Garbage collection: what is named, young or needed to resume is kept, with its ancestors."""
 
 import os
+import shlex
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +18,7 @@ from irlcli.store.lease import Patience, live_reader
 from irlcli.store.lock import exclusive, is_locked, lease_of
 from irlcli.store.read import index as read_index
 from irlcli.store.references import damaged_names, names
+from irlcli.store.scratch import INPUTS
 
 
 class Missing(NamedTuple):
@@ -42,22 +45,45 @@ class Missing(NamedTuple):
 
 
 def garbage(layout: Layout, grace_seconds: float, warn: Callable[[str], None]) -> list[Artefact]:
-    """Artefacts that no name needs and that are older than the grace period [s].
+    """Artefacts older than the grace period [s] that nothing needs which is kept.
 
-    Artefacts of a newer schema, and whatever their manifests mention, are never garbage.
+    Kept are named and younger artefacts, what the checkpoints of interrupted runs need unless they
+    are :func:`stale_work`, and the ancestors of all these. Artefacts of a newer schema, and whatever their manifests mention, are never garbage.
     """
     index = read_index(layout, warn)
     for name in damaged_names(layout):
         warn(f"{layout.names / name} is damaged: gc does not know what the name protects")
     for id16, lost in missing(layout, index).items():
         warn(f"{lost.text(id16)}; gc cannot protect the inputs of {id16}")
-    kept = index.reached_from(names(layout).values())
     limit = time.time() - grace_seconds
+    kept = index.reached_from(
+        [
+            *names(layout).values(),
+            *(
+                i
+                for i, artefact in index.artefacts.items()
+                if not _older(artefact.directory, limit)
+            ),
+            *(
+                artefact.id
+                for sha in _resumed_with(layout, limit)
+                for artefact in index.holders(sha)
+            ),
+        ]
+    )
     return [
         artefact
         for id16, artefact in index.artefacts.items()
         if id16 not in kept and _older(artefact.directory, limit)
     ]
+
+
+def _resumed_with(layout: Layout, limit: float) -> Iterator[str]:
+    """The contents that runs need which somebody may still resume."""
+    for file in layout.work.glob(f"*/{INPUTS}"):
+        if not _older(file.parent, limit):
+            with suppress(FileNotFoundError):
+                yield from file.read_text().split()
 
 
 def missing(layout: Layout, index: Index) -> dict[str, Missing]:
@@ -122,7 +148,8 @@ def collect(
         if damaged := damaged_names(layout):
             raise IntegrityError(
                 f"{layout.names / damaged[0]} is damaged, so gc does not know what the name protects",
-                f"name the artefact again: `irl name REF {damaged[0]}`",
+                "name the artefact again: "
+                f"`{shlex.join(['irl', 'name', 'REF', damaged[0], *layout.option])}`",
             )
         artefacts, stale = garbage(layout, grace_seconds, warn), stale_work(layout, grace_seconds)
         pointers: dict[str, list[Path]] = {}

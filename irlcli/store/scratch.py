@@ -2,12 +2,15 @@
 
 import hashlib
 import stat
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from irlcli.store.durable import remove, remove_leftovers, unique_name, write_durably
 
 CHECKPOINT = "checkpoint"
+# Beside it: the contents of the run's inputs, which gc keeps as long as the run can be resumed.
+INPUTS = "inputs"
 # Most have some tens of MB, but SAC's replay may have 4 million transitions of 3 KB.
 _MAX_BYTES = 16 << 30
 
@@ -16,14 +19,21 @@ class Scratch:
     """The working directory of one key: a checkpoint, and one output directory per attempt.
 
     The directory is created on first use.
+
+    Attributes:
+        directory: its path.
+        inputs: the sha256 of each input of the run.
     """
 
     def __init__(self, directory: Path):
         self.directory = directory
+        self.inputs: Sequence[str] = ()
 
     def save(self, data: bytes) -> None:
         """Replace the checkpoint with ``data``."""
         self.directory.mkdir(exist_ok=True)
+        if self.inputs and not (self.directory / INPUTS).exists():
+            write_durably(self.directory / INPUTS, "\n".join(self.inputs).encode())
         # In two parts: one would be a copy of the data in memory.
         write_durably(self.directory / CHECKPOINT, hashlib.sha256(data).digest(), data)
 
@@ -50,6 +60,7 @@ class Scratch:
     def discard_checkpoint(self) -> None:
         """Remove the checkpoint, so that the stage starts over."""
         remove(self.directory / CHECKPOINT)
+        remove(self.directory / INPUTS)
 
     def new_output(self) -> Path:
         """A new, empty output directory; those of dead processes are removed."""

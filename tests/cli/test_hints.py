@@ -157,6 +157,15 @@ def test_what_a_reference_may_be_is_in_the_hint(irl, store_copy):
     assert "irl train-airl" in hint(store_copy.airl)
 
 
+def test_a_hint_for_a_recording_can_be_pasted(irl, tmp_path):
+    recording, store = tmp_path / "two words.parquet", tmp_path / "runs"
+    recording.write_bytes(b"")
+    done = irl("train-airl", "--demos", recording, "--store", store)
+    words = shlex.split(done.err.splitlines()[-1].split("`")[1])
+    assert done.code == 3 and words[:3] == ["irl", "import", str(recording)]
+    assert words[-2:] == ["--store", str(store)]
+
+
 def session(store, profile="standard", overrides=(), sources=(), workers=1, tensorboard=None):
     return StageSession(
         store,

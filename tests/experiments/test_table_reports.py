@@ -274,7 +274,7 @@ def test_nothing_is_run(report, table_store):
 
 
 def test_a_damaged_provenance_is_named_and_can_be_repaired(report, irl, table_store, tmp_path):
-    copy = tmp_path / "runs"
+    copy = tmp_path / "two words"
     shutil.copytree(table_store, copy, symlinks=True)
     victim = Store(copy).resolve("demos").artefact
     path = victim.directory / "provenance.json"
@@ -285,7 +285,7 @@ def test_a_damaged_provenance_is_named_and_can_be_repaired(report, irl, table_st
     assert planned.code == 0 and f"{victim.id}/provenance.json was altered" in planned.err
     # A store to copy from is only read.
     away = irl("plan", "table1", *ROW, "--store", tmp_path / "none", "--from", copy, *common)
-    assert away.code == 0 and "provenance.json was altered" in away.err
+    assert away.code == 0 and f"provenance of {victim.id} in {copy} is damaged" in away.err
     done = report("table1", copy, *ROW)
     error, hint = done.err.splitlines()[-2:]
     assert done.code == 4 and victim.id in error
@@ -404,6 +404,9 @@ def test_results_of_another_profile_are_named(report, irl, table_store, tmp_path
     ):
         name = f"{profile}.lunar-lander.bounce.erm.0"
         assert irl("name", "erm.0", name, "--store", store).code == 0
+        # A reward is nothing that the report shows.
+        assert hint not in report("table1", store, small=[]).err
+        assert irl("name", "erm.0", f"{name}.id-returns", "--store", store).code == 0
         assert hint in report("table1", store, small=[]).err
 
 

@@ -97,6 +97,54 @@ def test_two_tables_do_not_give_two_results_one_name(tables, tmp_path):
     tables(weighed + 'settings = "own.toml"\n')
 
 
+ABLATION = """
+[{name}]
+rows = ["lunar-lander.bounce"]
+methods = ["{method}"]
+seeds = [0]
+measures = ["transfer-id"]
+base = "full"
+[{name}.variants]
+"full" = []
+"{variant}" = ["transfer.ceiling={ceiling}"]
+"""
+
+
+def test_variants_are_told_apart_as_the_names_of_steps_are(tables):
+    first = ABLATION.format(name="a", method="erm", variant="no ceiling", ceiling="none")
+    for method, variant, ceiling, alike in (
+        ("erm", "no-ceiling", "0.5", False),
+        ("erm", "no-ceiling", "none", True),
+        ("gail", "no ceiling", "0.5", True),
+        ("erm", "half", "0.5", True),
+    ):
+        second = ABLATION.format(name="b", method=method, variant=variant, ceiling=ceiling)
+        if alike:
+            assert {*tables(first + second)} == {"a", "b"}
+            continue
+        with pytest.raises(UsageError, match=r"'b' has no-ceiling\.erm in .* other overrides"):
+            tables(first + second)
+
+
+def test_a_bank_of_other_policies_is_another_result(tables):
+    def table(name, measures, more=""):
+        rows = 'rows = ["lunar-lander.bounce"]\nmethods = ["erm"]\nseeds = [0]'
+        return f"[{name}]\n{rows}\nmeasures = {measures}\n{more}\n"
+
+    first = table("a", ["transfer", "assess"])
+    assert {*tables(first + table("b", ["id", "transfer", "assess"]))} == {"a", "b"}
+    assert {*tables(first + table("b", ["transfer-id"], "retrainings = 2"))} == {"a", "b"}
+    for measures, more in ((["id", "assess"], ""), (["transfer", "assess"], "retrainings = 2")):
+        with pytest.raises(UsageError, match=r"'b' has erm\.assess in .* a bank of other policies"):
+            tables(first + table("b", measures, more))
+
+
+def test_only_what_a_command_takes_is_offered(irl, tmp_path):
+    for command, offered in (("plan", False), ("run", False), ("report", True)):
+        done = irl(command, "nope", "--store", tmp_path / "runs")
+        assert done.code == 2 and ("returns" in done.err) == ("table2" in done.err) == offered
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message", "hint"),
     [
@@ -139,6 +187,7 @@ def test_two_tables_do_not_give_two_results_one_name(tables, tmp_path):
         ("[0, 1]", "[0, 1]\nretrainings = 2", "unknown field 'defaults.retrainings'", "known"),
         ("[mine]", "[table2]", "'table2' is a report of its own", "another name"),
         ("[mine]", "[returns]", "'returns' is a report of its own", "another name"),
+        ("[mine]", "[seeds]", "'seeds' is a file of every table's report", "another name"),
         ("ant.leg-length", "none.toml.mass", "none.toml", "environment"),
         ("[mine]", "[Mine]", "'Mine' cannot be the name of a table", "lowercase"),
         ('"Mine"', "3", "mine.title: expected text, found a whole", "see"),

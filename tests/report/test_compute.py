@@ -30,6 +30,13 @@ def test_cells_are_means_over_seeds():
     assert found["deviation"] == pytest.approx(7**0.5)
 
 
+def test_only_a_mean_can_be_partial():
+    values = complete()
+    values[BOUNCE, "reused", "ood"] = [None]
+    found = cell(build(*example(values), {}, {}), BOUNCE, "reused", "ood")
+    assert (found["complete"], found["partial"], found["seeds"]) == (False, False, 0)
+
+
 def test_methods_are_compared_row_by_row():
     report = build(*example(complete()), {}, {})
     first = report.comparisons.iloc[0]

@@ -349,7 +349,9 @@ from irlcli.stages.base import From
 from irlcli.stages import collect_experts, sweep_maxent, train_maxent
 
 def request(stage):
-    config = load_config("gridworld", "smoke", overrides=["maxent.iterations=800"])
+    # A sweep trains several rewards; one round at least is left after the first checkpoint.
+    iterations = {"train-maxent": 800, "sweep-maxent": 100}[stage]
+    config = load_config("gridworld", "smoke", overrides=[f"maxent.iterations={iterations}"])
     groups = parse_settings("gridworld", "path-group=1,2,3")
     unseen = parse_settings("gridworld", "blocked=1")
     if stage == "sweep-maxent":

@@ -313,13 +313,14 @@ def test_one_restart_is_the_policy_without(runs, irl):
 
 def test_the_best_restart_alone_has_the_whole_budget(runs, irl):
     """Three restarts of one round; the best has a second, as if it had been alone from the start."""
-    line = [*RESTARTS[:-2], "--set", "transfer.total_steps=4096"]
-    each = ["--set", "transfer.restart_steps=2048"]
+    line = [*RESTARTS[:-2], "--set", "transfer.ppo.n_envs=1"]
+    line += ["--set", "transfer.restart_episodes=1"]
+    each = ["--set", "transfer.restart_steps=1024"]
     artefact = made(runs, irl(*line, *RESTARTS[-2:], *each, *common(runs)))
     rows = pq.read_table(artefact.directory / "metrics.parquet").to_pylist()
     kept = [row["round"] for row in rows if row["kept"]]
     assert kept == [0, 1] and len(rows) == 4
-    assert "8,192 steps" in irl("ls", "--store", runs).out
+    assert "4,096 steps" in irl("ls", "--store", runs).out
     whole = made(runs, irl(*line, *RESTARTS[-2:], *common(runs)))
     best = next(row["restart"] for row in rows if row["kept"])
     both = [

@@ -96,6 +96,26 @@ def test_grace_period(empty_store, family):
     assert len(empty_store.garbage(400 * DAY)) == 0
 
 
+def test_what_a_young_artefact_was_made_from_is_kept(empty_store, family):
+    age(family["airl"].directory, 0)
+    kept = ids(*(family[name] for name in ("airl", "demos", "expert")))
+    assert ids(*empty_store.garbage(DAY)) == ids(*family.values()) - kept
+
+
+def test_what_an_interrupted_run_needs_is_kept_while_it_can_be_resumed(empty_store, family):
+    airl = family["airl"]
+    with empty_store.working_on("a" * 64, wait=False) as scratch:
+        scratch.inputs = [airl.output("f").sha256]
+        scratch.save(b"state")
+    kept = ids(*(family[name] for name in ("airl", "demos", "expert")))
+    assert ids(*empty_store.garbage(DAY)) == ids(*family.values()) - kept
+    age(scratch.directory, 2)
+    assert ids(*empty_store.garbage(DAY)) == ids(*family.values())
+    with empty_store.working_on("a" * 64, wait=False) as scratch:
+        scratch.clear()
+    assert not scratch.directory.exists()
+
+
 def test_clock_set_back_removes_nothing(empty_store, family):
     """Artefacts dated in the future count as young."""
     for artefact in family.values():
@@ -124,8 +144,10 @@ def test_what_a_damaged_name_protects_is_not_deleted(irl, empty_store, family):
         assert listed.code == 0 and "best is damaged" in listed.err
         deleted = irl("gc", "--delete", "--grace-days", "0", "--store", empty_store.root)
         assert deleted.code == 4 and "best is damaged" in deleted.err
+        assert f"irl name REF best --store {empty_store.root}`" in deleted.err
         checked = irl("verify", "--store", empty_store.root)
         assert checked.code == 4 and "best" in checked.err
+        assert f"irl name REF NAME --store {empty_store.root}`" in checked.err
     assert len(empty_store.ids()) == 5
     assert irl("name", protected, "best", "--store", empty_store.root).code == 0
     assert irl("verify", "--store", empty_store.root).code == 0

@@ -102,6 +102,7 @@ def test_what_was_made_from_a_damaged_artefact_is_left_out_of_all(
     pulled = irl("pull", "--all", "--from", place, "--store", tmp_path / "other")
     assert pulled.code == 0 and f"skipping artefact {chain['airl'].id}" in pulled.err
     assert set(other(tmp_path).ids()) == {chain["expert"].id, other_expert.id}
+    assert {Path(line).name for line in pulled.out.split()} == set(other(tmp_path).ids())
 
 
 def test_a_damaged_artefact_here_is_not_pushed(irl, store, chain, url):
