@@ -130,18 +130,22 @@ def learned(config: Mapping[str, Any]) -> str:
     penalty, dropout = config.get("penalty", "none"), config.get("dropout")
     weight, select = config.get("penalty_weight"), config.get("select", "last")
     challenger, l2 = config.get("challenger"), config.get("l2")
+    more = [
+        f"selected by {select}" if select != "last" else None,
+        "from a clone" if config.get("bc_epochs") else None,
+        _averaged(config),
+        "to a plateau" if config.get("plateau_rounds") else None,
+        "with symmetries" if config.get("symmetries") else None,
+        _challenged(challenger) if isinstance(challenger, dict) else None,
+    ]
+    listed = ", ".join(filter(None, more))
     return _joined(
         [
             method_name(config) if config.get("grouping") is not None else None,
             f"lambda {_number(weight)}" if penalty != "none" else None,
             f"l2 {_number(l2)}" if l2 else None,
             f"dropping {_number(dropout)}" if dropout else None,
-            f"selected by {select}" if select != "last" else None,
-            "from a clone" if config.get("bc_epochs") else None,
-            _averaged(config),
-            "to a plateau" if config.get("plateau_rounds") else None,
-            "with symmetries" if config.get("symmetries") else None,
-            _challenged(challenger) if isinstance(challenger, dict) else None,
+            f"({listed})" if listed else None,
         ]
     )
 

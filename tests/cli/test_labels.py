@@ -24,12 +24,11 @@ def test_labels_tell_kinds_of_challengers_apart():
     ]
     assert "challengers" not in found[0]
     endings = ("with challengers", "with challengers per setting")
-    for label, ending in zip(found[1:], endings, strict=True):
-        assert label.endswith(ending)
+    assert [label.partition(" (")[2] for label in found[1:]] == [f"{end})" for end in endings]
 
 
 def test_labels_tell_rewards_learned_with_symmetries_apart():
-    assert labels.learned({"symmetries": True}) == "with symmetries"
+    assert labels.learned({"symmetries": True}) == "(with symmetries)"
     assert labels.learned({"symmetries": False}) == ""
 
 
@@ -40,8 +39,13 @@ def test_labels_tell_means_of_rounds_apart():
         for mean in ({}, averaged, averaged | {"averaged_by": "learning-rate"})
     )
     assert "mean" not in last
-    assert equal.endswith(" mean of 30 rounds") and "weighted" not in equal
-    assert weighted.endswith(" mean of 30 rounds by learning rate")
+    assert equal.endswith(" (mean of 30 rounds)")
+    assert weighted.endswith(" (mean of 30 rounds by learning rate)")
+
+
+def test_what_else_sets_a_reward_apart_is_a_list():
+    several = {"grouping": "pooled", "l2": 0.01, "bc_epochs": 3, "symmetries": True}
+    assert labels.learned(several).endswith(" l2 0.01 (from a clone, with symmetries)")
 
 
 def test_a_run_says_which_steps_resume(capsys):
