@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,13 +179,16 @@ def load_reward(
         IrlError: ``ref`` names no reward, the reward is damaged, or it does not fit the setting.
     """
     from irlcli.data.tensors import load_reward_file
-    from irlcli.envs.registry import resolve
+    from irlcli.envs.registry import forget, resolve
     from irlcli.errors import UsageError
     from irlcli.experiments.inputs import checked
     from irlcli.experiments.references import tensor_file
     from irlcli.stages.base import environment_key
     from irlcli.stages.running import frozen_reward
 
+    for name, value in (("gamma", gamma), ("ceiling", ceiling)):
+        if not isinstance(value, Real | None):
+            raise UsageError(f"{name} {value!r} is not a number", "give a number")
     if gamma is not None and not 0.0 <= gamma < 1.0:
         raise UsageError(
             f"gamma = {gamma:g} is not a discount factor",
@@ -192,6 +196,8 @@ def load_reward(
         )
     if ceiling is not None and not 0.0 <= ceiling <= 1.0:
         raise UsageError(f"ceiling = {ceiling:g} is not a quantile", "give a number from 0 to 1")
+    # Another call may have introduced another environment of the same name.
+    forget()
     if env is not None:
         resolve(env)
     opened = Store(Path(store))

@@ -157,6 +157,7 @@ def test_what_it_cannot_use_is_named(smoke_store, tmp_path):
         ({"ref": "nothing", "store": smoke_store.path}, "nothing"),
         ({"ref": "demos", "store": smoke_store.path}, "reward.pt"),
         ({"ref": path, "gamma": 1.0}, "gamma"),
+        ({"ref": path, "gamma": "0.9"}, "gamma '0.9' is not a number"),
         ({"ref": path, "ceiling": 1.5}, "ceiling"),
         ({"ref": path, "setting": "leg-length=99"}, "leg-length"),
         ({"ref": path, "setting": "goal-y=0"}, "observations of size"),

@@ -13,10 +13,11 @@ from __future__ import annotations
 import atexit
 import multiprocessing
 import signal
+import sys
 import traceback
 import weakref
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import RawArray
@@ -70,6 +71,18 @@ class _Shared:
             np.frombuffer(self.observations, dtype=np.float32).reshape(self.observation_shape),
             np.frombuffer(self.rewards, dtype=np.float64),
         )
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """A process started here does not run the user's script again, whose stage would wait for us."""
+    main = vars(sys.modules["__main__"])
+    known = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    main.update(dict.fromkeys(known))
+    try:
+        yield
+    finally:
+        main.update(known)
 
 
 def _work(
@@ -167,7 +180,8 @@ class WorkerWorlds:
                 args=(theirs, share, max_episode_steps, worker, workers, shared),
                 daemon=True,
             )
-            process.start()
+            with _without_script():
+                process.start()
             theirs.close()
             self._connections.append(ours)
             self._processes.append(process)

@@ -117,6 +117,7 @@ def _check_form(name: str, value: Any, forms: Sequence[str]) -> None:
 def in_python(text: str) -> str:
     """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
     text = text.replace("the same command again", "the same call again")
+    text = text.replace(" or IRL_STORE", "")
     return re.sub(
         r"`[^`]*`|--([a-z][a-z-]*)",
         lambda found: _argument(found[1]) if found[1] else found[0],
@@ -161,6 +162,8 @@ def merged(first: Sequence[str], later: Sequence[str]) -> list[str]:
 
 
 def _toml(value: Any) -> str:
+    # What NumPy holds, as Python's own values.
+    value = value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from irlcli import labels
 from irlcli.data.descriptions import Assessment
+from irlcli.envs import registry
 from irlcli.errors import UsageError
 from irlcli.experiments import references
 from irlcli.report.returns import as_json
@@ -72,6 +73,8 @@ class Stored:
         """
         import pandas as pd
 
+        # Another call may have introduced another environment of the same name.
+        registry.forget()
         store, artefact = self._session.store, self._artefact
         if output is None and self.stage == "evaluate":
             run = measured(self._session, artefact)

@@ -401,7 +401,8 @@ def budgets(p: Parameters) -> Table:
 
 def _weights(p: Parameters, row: Row) -> str:
     """Lambda of the config, and those of methods and runs that have their own; ``-`` without penalty."""
-    if all(method in METHODS and METHODS[method].penalty == "none" for method in p.methods):
+    methods = (p.learned_by,) if p.variants else p.methods
+    if all(method in METHODS and METHODS[method].penalty == "none" for method in methods):
         return "-"
     own = [f"{run}: {weight:g}" for run, weight in row.chosen.items()]
     return ", ".join([f"{row.config['airl']['penalty_weight']:g}", *own])

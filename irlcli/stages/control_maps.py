@@ -102,7 +102,7 @@ def _check(maps: CuedMapsConfig) -> None:
 
 def _weights(maps: CuedMapsConfig) -> tuple[float, ...]:
     """The lambdas, the smallest first."""
-    return tuple(sorted(maps.penalty_weights))
+    return tuple(sorted({*maps.penalty_weights}))
 
 
 def _strongest(maps: CuedMapsConfig, penalty: str) -> MapMethod:
@@ -136,7 +136,8 @@ def _sweeps(maps: CuedMapsConfig) -> Iterator[Case]:
             yield Case(
                 name=f"{features}.{name}",
                 strengths=maps.strengths,
-                variants=variants,
+                # An L2 of 0 is ERM.
+                variants=tuple(dict.fromkeys(variants)),
                 features=features,
             )
 

@@ -355,6 +355,8 @@ def test_lists_of_any_arrow_type_and_nested_lists_are_vectors(tmp_path):
         pa.large_list(pa.float64()),
         pa.list_(pa.float64(), 3),
         pa.list_(pa.list_(pa.float32(), 1)),
+        pa.list_view(pa.float32()),
+        pa.large_list_view(pa.float64()),
     ):
         other = made
         for name in ("obs", "next_obs"):

@@ -52,6 +52,24 @@ class Fragile(gymnasium.Env):
         return np.full(1, self.steps, dtype=np.float32), float(action), False, False, {}
 
 
+def test_a_script_without_a_guard_runs_once(tmp_path):
+    """A worker that ran it, too, would wait for the store that its parent holds."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from functools import partial\n"
+        "import gymnasium\n"
+        "from irlcli.envs.workers import WorkerWorlds\n"
+        "print('once', flush=True)\n"
+        "made = [partial(gymnasium.make, 'CartPole-v1')] * 2\n"
+        "worlds = WorkerWorlds(made, 10, workers=2)\n"
+        "print(worlds.reset([0, 1]).shape, __file__ is not None)\n"
+        "worlds.close()\n"
+    )
+    line = [sys.executable, script]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=200)
+    assert done.stdout.splitlines() == ["once", "(2, 4) True"], done.stderr
+
+
 def alive(pid: int) -> bool:
     try:
         with open(f"/proc/{pid}/stat") as stat:

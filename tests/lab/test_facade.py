@@ -8,13 +8,14 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import typer
 
 import irlcli
 from irlcli.cli.app import app
 from irlcli.errors import IntegrityError, Interrupted, NotFound, UsageError
-from irlcli.lab.arguments import words
+from irlcli.lab.arguments import overrides, words
 from irlcli.lab.display import NotebookConsole
 from irlcli.store import Store
 
@@ -193,6 +194,11 @@ def test_settings_may_be_lists(lab):
     assert [one.id for one in both] == [
         one.id for one in lab.evaluate(idle=True, env="lunar-lander", ood="engine-power=1.5x,2x")
     ]
+
+
+def test_what_numpy_holds_is_a_value():
+    given = {"a.b": np.True_, "c": np.float64(0.5), "d": np.array([1, 2]), "e": [np.int64(3)]}
+    assert overrides(given) == ["a.b=true", "c=0.5", "d=[1, 2]", "e=[3]"]
 
 
 def test_a_path_may_be_any_path_like_object(lab, tmp_path):

@@ -262,6 +262,14 @@ def test_a_lab_takes_the_environment_from_each_artefact(bench):
     assert status(bench, "train-airl", "--demos", first, "--method", "erm", *SMOKE) == "HIT"
     made_in = [lab.artefact(ref).parameters["environment"] for ref in (second, reward)]
     assert [environment["max_episode_steps"] for environment in made_in] == [40, 50]
+    # Reading one leaves nothing behind for the next.
+    for stored in (second, reward, second):
+        assert not stored.to_pandas().empty
+    lab.collect_experts("cart.toml", "mass=1x,2x")
+    assert irlcli.load_reward(reward.id, "runs").settings == ("mass=1x", "mass=2x")
+    lab.evaluate(idle=True, env="cart.toml", intervention="mass=2x").to_pandas()
+    lab.evaluate(policy=reward).to_pandas()
+    second.to_pandas()
 
 
 def test_artefacts_of_two_environments_of_one_name_are_not_combined(bench):

@@ -17,7 +17,7 @@ FIRST, SECOND = "bounce=0.1", "bounce=0.5"
 EXPERTS = {FIRST: (200.0, 50.0), SECOND: (100.0, 20.0)}
 
 
-def ablation(returns, experts=EXPERTS):
+def ablation(returns, experts=EXPERTS, method="erm"):
     """The report; ``returns`` maps (variant, measure, setting) to a return for each seed.
 
     In place of a return there may be a list: one for each retraining.
@@ -49,7 +49,7 @@ def ablation(returns, experts=EXPERTS):
         rows=ROWS[:1],
         methods=tuple(v.name for v in VARIANTS),
         variants=VARIANTS,
-        learned_by="erm",
+        learned_by=method,
         seeds=(0, 1, 2),
         cells=tuple(cells),
         runs={},
@@ -110,6 +110,12 @@ def test_a_variant_is_its_seeds_means_over_settings():
     assert no_ceiling["overrides"] == "transfer.ceiling=none" and no_ceiling["passed_80"] == 0
     assert (no_challengers["seeds"], no_challengers["pairs"]) == (2, 2)
     assert no_challengers["mean"] == pytest.approx(0.575) and pd.isna(no_challengers["student"])
+
+
+def test_a_lambda_is_shown_where_the_method_of_the_variants_has_a_penalty():
+    for method, shown in (("erm", "-"), ("irm", "1")):
+        (budget,) = [t for t in ablation(RETURNS, method=method).tables if t.title == "Budgets"]
+        assert budget.rows[0][budget.columns.index("lambda")] == shown
 
 
 def test_variants_are_compared_with_the_first_by_the_paired_test():

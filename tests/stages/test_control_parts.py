@@ -153,6 +153,12 @@ def test_cases_have_the_strengths_of_the_config():
     assert cases["gap.0.1"].strengths == (0.925, 0.825)
 
 
+def test_equal_methods_of_a_case_are_one():
+    maps = replace(SMOKE.maps, l2s=(0.0, 0.1, 0.1), penalty_weights=(1.0, 1.0, 100.0))
+    for case in control_maps.cases(maps):
+        assert len({*case.variants}) == len(case.variants), case.name
+
+
 def test_two_colours_have_strengths_of_their_own_in_every_seed(monkeypatch):
     (case,) = (c for c in control_maps.cases(SMOKE.maps) if c.name == "settings.3.colours.2")
     drawn, original = [], cued_fits.dataset

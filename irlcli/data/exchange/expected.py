@@ -121,6 +121,8 @@ def numbers(column: pa.Array, name: str, place: Locate) -> np.ndarray:
     kind = column.type
     if pa.types.is_dictionary(kind):
         return numbers(column.dictionary_decode(), name, place)
+    if pa.types.is_list_view(kind) or pa.types.is_large_list_view(kind):
+        return numbers(column.cast(pa.large_list(kind.value_type)), name, place)
     if pa.types.is_boolean(kind):
         return column.cast(pa.uint8()).to_numpy().view(bool)
     if pa.types.is_integer(kind) or pa.types.is_floating(kind):
