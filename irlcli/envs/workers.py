@@ -77,7 +77,7 @@ class _Shared:
 def _without_script() -> Iterator[None]:
     """A process started here does not run the user's script again, whose stage would wait for us."""
     main = vars(sys.modules["__main__"])
-    known = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    known: dict[str, Any] = {n: main[n] for n in ("__file__", "__spec__") if n in main}
     main.update(dict.fromkeys(known))
     try:
         yield
