@@ -178,13 +178,8 @@ def load_reward(
     Raises:
         IrlError: ``ref`` names no reward, the reward is damaged, or it does not fit the setting.
     """
-    from irlcli.data.tensors import load_reward_file
     from irlcli.envs.registry import forget, resolve
     from irlcli.errors import UsageError
-    from irlcli.experiments.inputs import checked
-    from irlcli.experiments.references import tensor_file
-    from irlcli.stages.base import environment_key
-    from irlcli.stages.running import frozen_reward
 
     for name, value in (("gamma", gamma), ("ceiling", ceiling)):
         if not isinstance(value, Real | None):
@@ -200,9 +195,25 @@ def load_reward(
     forget()
     if env is not None:
         resolve(env)
-    opened = Store(Path(store))
-    source, _ = tensor_file(opened, str(ref), "reward")
-    model, description = load_reward_file(checked(opened, source))
+    return reward_in(Store(Path(store)), str(ref), setting, gamma, ceiling)
+
+
+def reward_in(
+    store: Store,
+    ref: str,
+    setting: str | None = None,
+    gamma: float | None = None,
+    ceiling: float | None = None,
+) -> LearnedReward:
+    """As :func:`load_reward`, in an environment that is known already or described by ``ref``."""
+    from irlcli.data.tensors import load_reward_file
+    from irlcli.experiments.inputs import checked
+    from irlcli.experiments.references import tensor_file
+    from irlcli.stages.base import environment_key
+    from irlcli.stages.running import frozen_reward
+
+    source, _ = tensor_file(store, ref, "reward")
+    model, description = load_reward_file(checked(store, source))
     where = environment_key(description.env)
     frozen = frozen_reward(
         where, setting or description.settings[0], model, description, ceiling, gamma

@@ -323,7 +323,7 @@ def test_several_choices_are_compared_one_by_one(actions, words):
     """Each of these spaces flattens to size 5."""
     network = SimpleNamespace(observation_size=4, action_size=5, discrete=True, choices=(3, 2))
     about = SimpleNamespace(env="x", settings=(), method="erm", seed=0, network=network)
-    check = irlcli.rewards.LearnedReward(None, about).check_spaces
+    check = irlcli.LearnedReward(None, about).check_spaces
     observations = gymnasium.spaces.Box(-1, 1, (4,))
     if words is None:
         check(observations, actions)
@@ -336,7 +336,7 @@ def test_only_vectors_are_observations():
     """One of four states flattens to size 4, but a wrapper would hand over an index."""
     network = SimpleNamespace(observation_size=4, action_size=5, discrete=True, choices=())
     about = SimpleNamespace(env="x", settings=(), method="erm", seed=0, network=network)
-    check = irlcli.rewards.LearnedReward(None, about).check_spaces
+    check = irlcli.LearnedReward(None, about).check_spaces
     with pytest.raises(ValueError, match=r"observations in Discrete\(4\)"):
         check(gymnasium.spaces.Discrete(4), gymnasium.spaces.Discrete(5))
 

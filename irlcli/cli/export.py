@@ -102,9 +102,9 @@ def _spaces(env: str, setting: str) -> tuple[Any, Any, Any]:
 def _reward_to_torch(session: Session, ref: str, name: str, known: str | None) -> Path:
     with _new_file(session, Path(name)) as path:
         from irlcli.data.exchange.torch_export import write_reward
-        from irlcli.rewards import load_reward
+        from irlcli.rewards import reward_in
 
-        reward = load_reward(ref, session.store.root)
+        reward = reward_in(session.store, ref)
         arguments.check_env(ref, reward.env, known)
         write_reward(path, reward.module(), reward.about())
     return Path(name)

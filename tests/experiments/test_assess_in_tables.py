@@ -42,6 +42,10 @@ def made(tables, smoke_store, run_irl):
 
 def test_the_plan_names_the_bank(irl, tables, tmp_path):
     line = ["plan", "tiny", "--experiments", tables, "--profile", "smoke", "--store", tmp_path]
+    # The shipped tables have this reward's assessment on a bank of other policies.
+    named = irl(*line)
+    assert named.code == 2 and "bank of other policies" in named.err and "--tag" in named.err
+    line += ["--tag", "smoke"]
     steps = {s["name"] for s in json.loads(irl(*line, "--json").out)["steps"]}
     for value in SETTINGS:
         bank = [f"{ROW}.bank.{who}.{value}" for who in ("idle", "random", "clone-noise-0.25")]

@@ -39,7 +39,7 @@ def test_the_example_runs_from_another_directory(tmp_path, python):
         },
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=400,
     )
     assert done.returncode == 0, done.stderr
     assert "SAC on the reward irm: true return" in done.stdout
