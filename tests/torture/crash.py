@@ -187,7 +187,7 @@ def attack(part: str, chain: Chain, work: Path, short: bool) -> None:
     """Run one of :data:`PARTS` and print its measurements."""
     stage = "train-maxent"
     if part == "calls":
-        for each, stride in ((stage, 14),) if short else (("grid", 1), (stage, 6)):
+        for each, stride in ((stage, 42),) if short else (("grid", 1), (stage, 6)):
             found = killed_at_every_call(chain, each, work, stride)
             figures("crash", {f"{each}: kills, at every call by {stride}": found})
     elif part == "random":
