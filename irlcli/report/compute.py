@@ -145,7 +145,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             low, high = s.interval or (None, None)
             progress = values["progress"].mean() if len(values) else math.nan
             # Baselines have one sample and no seed.
-            sampled = {*values.index, *([None] if len(values) else [])}
+            sampled = {None, *values.index} if len(values) else set()
             planned = p.cells_of(row.name, agent, measure)
             found.append(
                 {

@@ -45,10 +45,11 @@ class Missing(NamedTuple):
 
 
 def garbage(layout: Layout, grace_seconds: float, warn: Callable[[str], None]) -> list[Artefact]:
-    """Artefacts older than the grace period [s] that nothing needs which is kept.
+    """All artefacts but those that are kept.
 
-    Kept are named and younger artefacts, what the checkpoints of interrupted runs need unless they
-    are :func:`stale_work`, and the ancestors of all these. Artefacts of a newer schema, and whatever their manifests mention, are never garbage.
+    Kept are named artefacts, those younger than the grace period [s], what a checkpoint younger than
+    that needs, artefacts of a newer schema, whatever their manifests mention, and the ancestors of
+    all these.
     """
     index = read_index(layout, warn)
     for name in damaged_names(layout):
@@ -56,34 +57,19 @@ def garbage(layout: Layout, grace_seconds: float, warn: Callable[[str], None]) -
     for id16, lost in missing(layout, index).items():
         warn(f"{lost.text(id16)}; gc cannot protect the inputs of {id16}")
     limit = time.time() - grace_seconds
-    kept = index.reached_from(
-        [
-            *names(layout).values(),
-            *(
-                i
-                for i, artefact in index.artefacts.items()
-                if not _older(artefact.directory, limit)
-            ),
-            *(
-                artefact.id
-                for sha in _resumed_with(layout, limit)
-                for artefact in index.holders(sha)
-            ),
-        ]
-    )
-    return [
-        artefact
-        for id16, artefact in index.artefacts.items()
-        if id16 not in kept and _older(artefact.directory, limit)
-    ]
+    young = [i for i, a in index.artefacts.items() if not _older(a.directory, limit)]
+    resumed = [a.id for sha in _resumed_with(layout, limit) for a in index.holders(sha)]
+    kept = index.reached_from([*names(layout).values(), *young, *resumed])
+    return [artefact for id16, artefact in index.artefacts.items() if id16 not in kept]
 
 
 def _resumed_with(layout: Layout, limit: float) -> Iterator[str]:
-    """The contents that runs need which somebody may still resume."""
+    """The sha256 of the inputs of runs that somebody may still resume."""
     for file in layout.work.glob(f"*/{INPUTS}"):
-        if not _older(file.parent, limit):
+        # A link or a pipe is none of ours.
+        if file.is_file() and not file.is_symlink() and not _older(file.parent, limit):
             with suppress(FileNotFoundError):
-                yield from file.read_text().split()
+                yield from file.read_text(errors="replace").split()
 
 
 def missing(layout: Layout, index: Index) -> dict[str, Missing]:

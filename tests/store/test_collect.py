@@ -111,6 +111,9 @@ def test_what_an_interrupted_run_needs_is_kept_while_it_can_be_resumed(empty_sto
     assert ids(*empty_store.garbage(DAY)) == ids(*family.values()) - kept
     age(scratch.directory, 2)
     assert ids(*empty_store.garbage(DAY)) == ids(*family.values())
+    # Damaged, it protects nothing.
+    (scratch.directory / "inputs").write_bytes(b"\xff\x00")
+    assert ids(*empty_store.garbage(DAY)) == ids(*family.values())
     with empty_store.working_on("a" * 64, wait=False) as scratch:
         scratch.clear()
     assert not scratch.directory.exists()

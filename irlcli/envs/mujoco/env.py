@@ -26,7 +26,7 @@ from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
 from irlcli.errors import StageFailed, first_line
 
 _KNOBS = {knob.argument: knob for spec in MUJOCO_ROBOTS for knob in spec.knobs.values()}
-# What moves faster [m/s] is being thrown apart: MuJoCo itself warns only at 1e10.
+# A robot that moves faster [m/s] is being thrown apart. MuJoCo itself warns only at 1e10.
 _FASTEST = 100.0
 _UNSTABLE = "the simulation is unstable: a position, speed or acceleration is huge or not a number"
 # MuJoCo counts its warnings by kind.
@@ -40,8 +40,8 @@ class Robot(MujocoEnv, EzPickle):
     Observations are Gymnasium's, as float32. Actions are clipped to the motors' range and have
     double precision. ``info["progress"]`` is the distance [m] that the robot moved forward.
 
-    If the simulation becomes unstable, or moves faster than 100 m/s, the episode is truncated: the step returns the last
-    observation, reward 0 and ``info["error"]``.
+    If the simulation becomes unstable, or the robot moves faster than 100 m/s, the episode is
+    truncated: the step returns the last observation, reward 0 and ``info["error"]``.
 
     Args:
         render_mode: ``None``, or one of Gymnasium's, which need OpenGL.
