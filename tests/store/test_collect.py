@@ -112,6 +112,7 @@ def test_what_an_interrupted_run_needs_is_kept_while_it_can_be_resumed(empty_sto
     age(scratch.directory, 2)
     assert ids(*empty_store.garbage(DAY)) == ids(*family.values())
     # Damaged, it protects nothing.
+    age(scratch.directory, 0)
     (scratch.directory / "inputs").write_bytes(b"\xff\x00")
     assert ids(*empty_store.garbage(DAY)) == ids(*family.values())
     with empty_store.working_on("a" * 64, wait=False) as scratch:
