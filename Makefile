@@ -58,8 +58,9 @@ $(READY): pyproject.toml constraints.txt
 	$(VENV)/bin/pip install --quiet --constraint constraints.txt --editable '.[test,dev]'
 	touch $@
 
+# On two cores: a third worker is at work while other tests wait.
 test: $(READY)
-	$(VENV)/bin/python -m pytest -n 2
+	$(VENV)/bin/python -m pytest -n 3
 
 test-cluster: $(READY)
 	command -v slurmctld > /dev/null && command -v sshfs > /dev/null || \
