@@ -60,6 +60,10 @@ def locked(
                 os.ftruncate(descriptor, 0)
                 os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
         yield problem
+        if not shared and problem is None:
+            # Later, others may share the lock, and this process is not to be named for them.
+            with suppress(OSError):
+                os.ftruncate(descriptor, 0)
     finally:
         os.close(descriptor)
 

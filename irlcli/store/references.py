@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -86,7 +87,8 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     head = text.partition("/")[0]
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
-    listing = f"{layout.listing}, `irl pull NAME --from STORE` copies one from another store"
+    pull = shlex.join(["irl", "pull", "NAME", "--from", "STORE", *layout.option])
+    listing = f"{layout.listing}, `{pull}` copies one from another store"
     close = closest(head, names(layout))
     if close is not None:
         listing = f"did you mean {close!r}? {listing}"

@@ -157,6 +157,13 @@ def test_what_a_damaged_name_protects_is_not_deleted(irl, empty_store, family):
     assert irl("verify", "--store", empty_store.root).code == 0
 
 
+def test_a_collection_that_ended_is_not_named_as_the_user_of_the_store(empty_store, family):
+    empty_store.collect(400 * DAY)
+    with empty_store.in_use(), pytest.raises(Busy) as caught:
+        Store(empty_store.root).collect(DAY)
+    assert str(os.getpid()) not in caught.value.message
+
+
 def test_collect_refuses_a_store_in_use(empty_store, family):
     with empty_store.in_use(), pytest.raises(Busy):
         Store(empty_store.root).collect(DAY)
