@@ -34,8 +34,8 @@ def tensor_file(
     A reference to a whole artefact means its file of that kind.
 
     Raises:
-        NotFound: ``ref`` names nothing, or an artefact without such a file.
-        UsageError: a tensor file of the other kind.
+        NotFound: ``ref`` names nothing.
+        UsageError: an artefact without such a file, or a tensor file of the other kind.
         IntegrityError: damaged, foreign or hostile.
     """
     resolved = store.resolve(ref)
@@ -116,6 +116,7 @@ def student_beside(store: Store, reward: Source, origin: descriptions.Reward) ->
 
     Raises:
         NotFound: there is none beside the reward's file, or that of another reward.
+        UsageError: the reward's artefact has none.
     """
     if reward.artefact is not None:
         return source_in(reward.artefact, _required(reward.artefact, "policy.pt"))
@@ -214,6 +215,7 @@ def summary(store: Store, artefact: Artefact) -> descriptions.Evaluation:
     """The summary of an evaluation.
 
     Raises:
+        UsageError: an artefact without a summary.
         IntegrityError: damaged.
     """
     introduce(artefact)
@@ -227,7 +229,7 @@ def output(
     """The JSON output ``name`` of ``artefact`` as a ``form``.
 
     Raises:
-        NotFound: the artefact has no such output.
+        UsageError: the artefact has no such output.
         IntegrityError: damaged, or not a ``form``.
     """
     path = store.open(artefact, _required(artefact, name))
@@ -242,7 +244,7 @@ def _required(artefact: Artefact, name: str) -> str:
             "policy.pt": "`irl train-airl` or `irl transfer`, or an expert",
         }
         wanted = f"name an artefact of {makers[name]}; " if name in makers else ""
-        raise NotFound(
+        raise UsageError(
             f"artefact {artefact.id} ({artefact.manifest.record.stage}) holds no {name}",
             f"{wanted}this one holds: {', '.join(names)}",
         )

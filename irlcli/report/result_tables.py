@@ -400,12 +400,13 @@ def budgets(p: Parameters) -> Table:
 
 
 def _weights(p: Parameters, row: Row) -> str:
-    """Lambda of the config, and those of methods and runs that have their own; ``-`` without penalty."""
+    """Lambda of the config where a run has none of its own, and each run's own; ``-`` without penalty."""
     methods = (p.learned_by,) if p.variants else p.methods
-    if all(method in METHODS and METHODS[method].penalty == "none" for method in methods):
-        return "-"
+    weighed = [m for m in methods if m not in METHODS or METHODS[m].penalty != "none"]
     own = [f"{run}: {weight:g}" for run, weight in row.chosen.items()]
-    return ", ".join([f"{row.config['airl']['penalty_weight']:g}", *own])
+    if any(not {m, f"{m} {seed}"} & row.chosen.keys() for m in weighed for seed in p.seeds):
+        own.insert(0, f"{row.config['airl']['penalty_weight']:g}")
+    return ", ".join(own) or "-"
 
 
 def costs(p: Parameters) -> Table:

@@ -22,6 +22,22 @@ def test_the_papers_numbers_stand_under_ours():
     assert column(table(found, "Comparisons"), "Student, paper")[0] == "0.049"
 
 
+@pytest.mark.parametrize(
+    ("chosen", "shown"),
+    [
+        ({}, "1"),
+        ({"irm": 10.0}, "irm: 10"),
+        ({"irm 0": 10.0, "irm 1": 0.1, "irm 2": 3.0}, "irm 0: 10, irm 1: 0.1, irm 2: 3"),
+        ({"irm 0": 10.0, "irm 2": 3.0}, "1, irm 0: 10, irm 2: 3"),
+    ],
+)
+def test_the_configs_lambda_is_shown_where_a_run_has_it(chosen, shown):
+    p, points = example(complete())
+    rows = tuple(msgspec.structs.replace(row, chosen=chosen) for row in p.rows)
+    p = msgspec.structs.replace(p, rows=rows)
+    assert column(table(build(p, points, {}, {}), "Budgets"), "lambda")[0] == shown
+
+
 def test_reused_experts_stand_in_every_table():
     found = build(*example(complete()), {}, {})
     reused = [column(t, "training experts, reused") for t in found.tables[:3]]

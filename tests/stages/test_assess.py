@@ -280,8 +280,8 @@ def test_an_expert_of_another_store_is_used(smoke_store, irl, tmp_path):
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["demos"], 3, "holds no reward.pt"),
-        (["moved"], 3, "holds no reward.pt"),
+        (["demos"], 2, "holds no reward.pt"),
+        (["moved"], 2, "holds no reward.pt"),
         (["airl/policy.pt"], 2, "not a reward"),
         (["airl", "--ood", "leg-length=2x"], 2, "'leg-length'"),
         (["airl", "--ood", "1.5x", "--intervention", "bounce"], 2, "both name settings"),
