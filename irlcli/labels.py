@@ -51,7 +51,7 @@ def environment_of(parameters: Mapping[str, Any]) -> Any:
 def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
     """What an evaluation's policy and a retrained policy's reward were made from, if stored.
 
-    Of a choice of lambda, the method. ``makers`` maps the sha256 of every stored output to the
+    For a choice of lambda it is the method. ``makers`` maps the sha256 of every stored output to the
     record of the stage that made it.
     """
     if record.stage == "choose-penalty":

@@ -2,8 +2,10 @@
 
 Exceptions: random actions in a built-in environment (:func:`irlcli.rl.rollout.roll_out`); by torch
 and NumPy from one seed, the noise of a trained policy's actions and its minibatches; the images
-under symmetries that all settings share before the first round of AIRL; and MaxEnt's held-out
-episodes, where the k-th trained and the k-th unseen setting share a stream.
+under symmetries that all settings share before the first round of AIRL; MaxEnt's held-out episodes,
+where the k-th trained and the k-th unseen setting share a stream; the start states in which a lambda
+is chosen for reward seed 0, which are those of the evaluations; and the exact controls, which seed
+generators of their own (:mod:`irlcli.controls`).
 """
 
 import zlib

@@ -589,11 +589,19 @@ def test_one_challenger_in_all_settings_is_in_no_key():
     joint, own = (with_field(in_use(), name, value) for value in (False, True))
     assert key(airl(joint)) == key(airl(in_use())) != key(airl(own))
 
-    # One of the two selects the round.
-    def alone(config):
-        return key(train_airl.request(From(demos(config)), ENV, SETTINGS[:2], config.airl))
+    assert key(alone(own)) == key(alone(joint))
 
-    assert alone(own) == alone(joint)
+
+def alone(config):
+    """A reward learned in one setting: the other one selects the round."""
+    return train_airl.request(From(demos(config)), ENV, SETTINGS[:2], config.airl)
+
+
+def test_with_one_setting_the_pairing_of_samples_is_in_no_key():
+    config = with_field(in_use(), "airl.grouping", "balanced")
+    pooled, matched = (with_field(config, "airl.pairing", p) for p in ("pooled", "matched"))
+    assert key(airl(pooled)) != key(airl(matched))
+    assert key(alone(pooled)) == key(alone(matched))
 
 
 def test_training_to_the_end_is_in_no_key():

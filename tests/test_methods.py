@@ -43,7 +43,7 @@ def test_names_titles_and_colours_tell_methods_apart():
 @pytest.mark.parametrize("name", ADVERSARIAL)
 def test_what_a_method_trains_has_its_name(name):
     request = train_airl.request(DEMOS, LANDER, SETTINGS, config(name).airl)
-    assert train_airl.name(request.parameters.airl) == name
+    assert train_airl.method_of(request.parameters.airl) == name
     assert request.label.startswith(f"train-airl {name} ")
 
 
@@ -66,7 +66,7 @@ def test_a_combination_without_a_name_is_called_by_its_parts():
 def test_irm_with_dropout_is_still_irm_and_says_so():
     airl = config("irm", "airl.dropout=0.3").airl
     request = train_airl.request(DEMOS, LANDER, SETTINGS, airl)
-    assert train_airl.name(request.parameters.airl) == "irm"
+    assert train_airl.method_of(request.parameters.airl) == "irm"
     assert "dropping 0.3" in request.label
 
 

@@ -78,11 +78,15 @@ class ClusterOptions(NamedTuple):
         if asks and makes:
             raise UsageError(f"{asks} makes no step", "omit --out and --jobs")
         if choice.until is not None and directory is not None:
-            raise UsageError("--until makes no report, so --out has no files", "omit one of them")
+            raise UsageError(
+                "--out needs a report, but --until stops before it", "omit one of them"
+            )
         if choice.only is not None and self.cluster is not None:
             raise UsageError("--only cannot be combined with --cluster", "omit one of them")
         if self.detach and directory is not None:
-            raise UsageError("--detach makes no report, so --out has no files", "omit one of them")
+            raise UsageError(
+                "--out needs a report, but --detach waits for none", "omit one of them"
+            )
         if self.cluster is not None and self.cluster not in CLUSTERS:
             raise UsageError(f"unknown --cluster {self.cluster!r}", suggest(self.cluster, CLUSTERS))
         slurm = {

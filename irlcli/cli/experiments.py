@@ -209,17 +209,17 @@ def run(
     """
     choice = TableChoice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     options = ClusterOptions(
-        cluster,
-        partition,
-        time,
-        cpus,
-        array_parallelism,
-        sbatch,
-        requeues,
-        jobs,
-        detach,
-        status,
-        cancel,
+        cluster=cluster,
+        partition=partition,
+        time=time,
+        cpus=cpus,
+        parallelism=array_parallelism,
+        sbatch=sbatch,
+        requeues=requeues,
+        jobs=jobs,
+        detach=detach,
+        status=status,
+        cancel=cancel,
     )
     options.check(choice, directory, session.dry_run)
     runner = session.runner()

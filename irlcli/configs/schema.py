@@ -183,7 +183,7 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     restart_episodes: Count | UnsetType = UNSET
 
     @property
-    def trained_by(self) -> PPOConfig | SACConfig:
+    def algorithm_config(self) -> PPOConfig | SACConfig:
         """The config of ``algorithm``; all but SAC take PPO's."""
         return self.sac if self.algorithm == "sac" else self.ppo
 
@@ -196,7 +196,7 @@ class DemonstrationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Policies trained from random weights while the reward is learned, as it will be used.
+    """Policies trained from random weights on the current reward, as later on the frozen one.
 
     A challenger is trained on the current g, in the settings trained on. Its episodes are
     negatives, so the reward corrects the states that a new policy goes through.
@@ -256,12 +256,11 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         actions: what g and log pi see: the policy's samples (``sampled``), or what the environment
             clips them to (``executed``).
         bc_epochs: epochs of behavioural cloning before the first round.
-        dropout: probability that a hidden unit of the discriminator is left out of an update.
+        dropout: probability that a hidden unit of the discriminator is omitted in an update.
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Empty is all.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
-            spaced as ``averaged_by`` says, up to the last. Each stands for the rounds since the one
-            before it; early ones may lie in the penalty's warm-up. 1 is the last g alone.
+            spaced as ``averaged_by`` says, up to the last. Each represents the rounds since the one before; early ones may lie in the penalty's warm-up. 1 is the last g alone.
         averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
             the discriminator's ``learning-rate``, so that early rounds count more when it falls.
         plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is

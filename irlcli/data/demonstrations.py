@@ -44,12 +44,12 @@ class Demonstrations:
         """Refuse demonstrations of another environment, or without one of ``settings``.
 
         Raises:
-            IntegrityError: naming what they are of, and what is asked for.
+            IntegrityError: naming what they are of, and what is needed.
         """
         if self.env != env or not set(settings) <= set(self.trajectories):
             raise IntegrityError(
                 f"the demonstrations are of {self.env} {', '.join(self.trajectories)}, but "
-                f"{env} {', '.join(settings)} is asked for"
+                f"{env} {', '.join(settings)} is needed"
             )
 
 

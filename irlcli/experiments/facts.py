@@ -50,7 +50,7 @@ def left_out(
 ) -> list[Others]:
     """Artefacts on the same subject as a ``wanted`` one, but with other parameters or inputs.
 
-    They are grouped by how they differ: from the most similar one, where variants want several.
+    They are grouped by how they differ from the most similar wanted one.
     ``used`` are the ids of those that the report does use.
     """
     # By digest: an artefact of somebody else's may hold lists and tables where ours hold text.

@@ -47,7 +47,7 @@ def introduce(artefact: Artefact) -> None:
     if from_artefact and not _is_made_in(known, made, made.own):
         assert known.own is not None
         raise UsageError(
-            f"artefact {artefact.id} was made in another {made.name!r} than {known.own.source}",
+            f"artefact {artefact.id} was made in another version of {made.name!r} than {known.own.source}",
             "name artefacts of one and the same environment",
         )
 

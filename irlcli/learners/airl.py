@@ -206,7 +206,7 @@ class AIRL:
         index: int,
         rollouts: Sequence[Rollout],
         policy: Policy,
-        challenge: Sequence[Rollout] = (),
+        challenger_rollouts: Sequence[Rollout] = (),
     ) -> list[dict[str, float]]:
         """Train the discriminator on the rollouts of round ``index`` and those of a challenger.
 
@@ -227,20 +227,26 @@ class AIRL:
             config.penalty_warmup_rounds,
             config.penalty_ramp_rounds,
         )
-        generated, challenged = self._generated(rollouts), self._generated(challenge)
-        self._normalise([d.observations for d, _ in (*generated, *challenged)], index)
-        current = [self._pool(data, policy) for data, _ in generated]
+        student_episodes = self._whole_episodes(rollouts)
+        challenger_episodes = self._whole_episodes(challenger_rollouts)
+        self._normalise(
+            [d.observations for d, _ in (*student_episodes, *challenger_episodes)], index
+        )
+        current = [self._pool(data, policy) for data, _ in student_episodes]
         expert = [self._pool(join(episodes), policy) for episodes in self._demonstrations]
         risks = self._risks(current, self._replay, expert, policy)
         challenger_risks = None
-        if challenged:
-            pools = [self._pool(data, None) for data, _ in challenged]
+        if challenger_episodes:
+            pools = [self._pool(data, None) for data, _ in challenger_episodes]
             challenger_risks = self._risks(pools, self._challenger_replay, expert, None)
         generator = torch.Generator().manual_seed(derive("discriminator", self._seed, index)[0])
         losses = self._optimise(index, risks, challenger_risks, weight, generator)
         if config.replay_share > 0.0:
             rng = np.random.default_rng(derive("replay", self._seed, index)[0])
-            for replay, found in ((self._replay, generated), (self._challenger_replay, challenged)):
+            for replay, found in (
+                (self._replay, student_episodes),
+                (self._challenger_replay, challenger_episodes),
+            ):
                 for setting, (data, numbers) in enumerate(found):
                     replay.add(setting, data, numbers, rng)
         if self.network.members > 1:
@@ -318,7 +324,7 @@ class AIRL:
             return self.config.learning_rate
         return self.config.learning_rate * (1.0 - index / self._rounds)
 
-    def _generated(self, rollouts: Sequence[Rollout]) -> list[tuple[Transitions, np.ndarray]]:
+    def _whole_episodes(self, rollouts: Sequence[Rollout]) -> list[tuple[Transitions, np.ndarray]]:
         """Each setting's transitions of this round, and the numbers of their episodes."""
         found = []
         for setting in range(self._settings if rollouts else 0):

@@ -44,7 +44,7 @@ class Risks(NamedTuple):
         L_k = sum_e shares[k, e] ( log Z^e - occupancy[k, e] . phi )
 
     is the mean negative causal log-likelihood of the risk's demonstrations, in expectation over
-    the dynamics (Ziebart et al. 2010). Its gradient by phi(s) is -gap_k(s), where
+    the dynamics (Ziebart et al. 2010). Its gradient with respect to phi(s) is -gap_k(s), where
 
         gap_k = sum_e shares[k, e] ( occupancy[k, e] - rho_pi^e ).
 

@@ -16,7 +16,8 @@ from irlcli.errors import StageFailed
 from irlcli.learners.actions import ActionView, Policy
 from irlcli.trajectories import Trajectory, transitions
 
-HELD_OUT_SHARE = 5  # one episode in so many, at least one
+# One episode in so many is held out, at least one.
+HOLD_OUT_ONE_IN = 5
 
 
 class BestRound:
@@ -91,7 +92,7 @@ def hold_out(
     Raises:
         ValueError: there is a single episode.
     """
-    count = max(1, len(episodes) // HELD_OUT_SHARE)
+    count = max(1, len(episodes) // HOLD_OUT_ONE_IN)
     if len(episodes) <= count:
         raise ValueError("one demonstration: none can be held out")
     return episodes[:-count], episodes[-count:]

@@ -4,7 +4,7 @@ A penalty of adversarial learners is a function ``discriminator(samples, options
 :class:`Samples` to a scalar tensor, differentiable in the discriminator's weights.
 
 A penalty of MaxEnt IRL is a function ``occupancy(at)`` of :class:`Occupancies` to a value [R, K]
-and its gradient by phi [R, K, S].
+and its gradient with respect to phi [R, K, S].
 """
 
 from collections.abc import Callable
@@ -61,7 +61,7 @@ class Occupancies(NamedTuple):
 
     Attributes:
         phi: [R, S], the reward of each state, or of each kind of state.
-        gap: [R, K, S], rho_E - rho_pi; a risk's gradient by phi is -gap.
+        gap: [R, K, S], rho_E - rho_pi; a risk's gradient with respect to phi is -gap.
         weights: [R, K], of the risks; a row sums to one. Zero where a run has fewer than K risks.
         risks: [R, K], mean negative log-likelihoods [nats per episode].
         response: computes d gap / dw [R, K, S] at w = 1 for the reward w phi. By symmetry this is

@@ -8,7 +8,7 @@ from irlcli.penalties import Occupancies
 
 
 def occupancy(at: Occupancies) -> tuple[np.ndarray, np.ndarray]:
-    """||gap||^2 ||phi||^2 [R, K], and its gradient by phi, 2 ||gap||^2 phi [R, K, S].
+    """||gap||^2 ||phi||^2 [R, K], and its gradient with respect to phi, 2 ||gap||^2 phi [R, K, S].
 
     The gap is held fixed. By Cauchy-Schwarz this bounds :mod:`irlcli.penalties.irmv1` from above.
     It is a weight decay of the reward whose strength is how badly a risk's occupancy is matched.

@@ -37,7 +37,7 @@ def discriminator(samples: Samples, options: PenaltyOptions) -> torch.Tensor:
 
 
 def occupancy(at: Occupancies) -> tuple[np.ndarray, np.ndarray]:
-    """(q_k / w_k - 1) L_k / lambda [R, K] of the risks L_k, and its gradient by phi [R, K, S].
+    """(q_k / w_k - 1) L_k / lambda [R, K] of the risks L_k, and its gradient with respect to phi [R, K, S].
 
     Their weights w are the shares at lambda = 0, so that q is proportional to w exp(lambda L). The
     shares q are held fixed.

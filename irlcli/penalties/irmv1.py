@@ -47,9 +47,9 @@ def scale_gradient(logits: torch.Tensor, scaled: torch.Tensor) -> torch.Tensor:
 
 
 def occupancy(at: Occupancies) -> tuple[np.ndarray, np.ndarray]:
-    """(sum_s phi(s) gap(s))^2 [R, K], and its gradient by phi [R, K, S].
+    """(sum_s phi(s) gap(s))^2 [R, K], and its gradient with respect to phi [R, K, S].
 
-    The sum is the likelihood's gradient by psi at psi = 1; this is its square (paper Eq. 9),
+    The sum is the likelihood's gradient with respect to psi at psi = 1; this is its square (paper Eq. 9),
     differentiated with the gap held fixed. :mod:`irlcli.penalties.irmv1_full` does not hold it
     fixed.
     """

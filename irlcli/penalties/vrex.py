@@ -32,7 +32,7 @@ def discriminator(samples: Samples, options: PenaltyOptions) -> torch.Tensor:
 
 
 def occupancy(at: Occupancies) -> tuple[np.ndarray, np.ndarray]:
-    """(L_k - sum w L)^2 [R, K] of the risks L_k, and its gradient by phi [R, K, S].
+    """(L_k - sum w L)^2 [R, K] of the risks L_k, and its gradient with respect to phi [R, K, S].
 
     The sum of the values, weighted by w, is the variance, and that of the gradients its exact
     gradient: what the mean adds to them cancels. The risks are negative log-likelihoods, so

@@ -11,13 +11,11 @@ from irlcli.data.descriptions import (
     Assessed,
     Assessment,
     BankEntry,
-    Measured,
     RewardOrigin,
 )
 from irlcli.report.reward_quality import (
     Member,
     agreement,
-    difference,
     measured,
     return_distance,
     split_regret,
@@ -76,10 +74,10 @@ def _in(setting: str, members: Sequence[Member], epic: float | None) -> Assessed
     retrained = [m for m in members if m.kind in ("retrained", "from-student")]
     return replace(
         found,
-        expert_minus_idle=difference(_per_step(of["expert"]), _per_step(of["idle"])),
+        expert_minus_idle=measured(_per_step(of["expert"]) - _per_step(of["idle"])),
         retrained=tuple(split_regret(m, of["expert"], of["random"]) for m in retrained),
     )
 
 
-def _per_step(member: Member) -> Measured:
-    return measured(member.learned / np.asarray(member.steps, np.float64))
+def _per_step(member: Member) -> np.ndarray:
+    return member.learned / np.asarray(member.steps, np.float64)

@@ -106,7 +106,7 @@ def build(
         *caveats.below_bar(p, points),
         *caveats.not_imitated(cells),
         *caveats.short_of_expert(learned_returns),
-        *caveats.yardsticks(cells, verdicts=not (learned_returns.empty and reward_quality.empty)),
+        *caveats.criteria(cells, verdicts=not (learned_returns.empty and reward_quality.empty)),
         *caveats.saturated(discriminators),
         *caveats.identical(episodes),
         *ablation.without_effect(p),

@@ -126,8 +126,8 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
             parts += [
                 f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
-            if r.uncertain:
-                parts.append(f"Uncertain (within two standard errors): {r.uncertain}.")
+            if r.short_uncertain:
+                parts.append(f"Uncertain (within two standard errors): {r.short_uncertain}.")
             found.append(
                 f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.judged} retrained "
                 f"policies. {' '.join(parts)}"
@@ -135,12 +135,12 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
     return found
 
 
-def yardsticks(cells: pd.DataFrame, verdicts: bool) -> list[str]:
+def criteria(cells: pd.DataFrame, verdicts: bool) -> list[str]:
     """Shares and verdicts are measured differently; a page with both must say so."""
     if not verdicts or cells["of_expert"].isna().all():
         return []
     return [
-        "Two yardsticks: shares of the expert and the gates divide by the expert's whole return; the "
+        "Two criteria: shares of the expert and the gates divide by the expert's whole return; the "
         "verdicts (retrained, short) by what it earns above the random agent. One policy can pass one "
         "and fail the other."
     ]
@@ -171,7 +171,7 @@ def identical(episodes: Episodes) -> list[str]:
     return [
         f"Identical: {row}, {', '.join(measures)}: "
         f"{', '.join(f'{title(a)} seed {s}' for a, s in runs)} have bitwise equal returns: neither "
-        "seed nor method made a difference between them."
+        "the seed nor the method had an effect."
         for (row, runs), measures in groups.items()
     ]
 

@@ -13,8 +13,9 @@ Most functions take *points*: a row per evaluation and setting with the columns
                   means over episodes. Progress may be missing. The learned return is known only
                   of retrained policies, and of the expert scored by their reward; both are under
                   the policy's ceiling
-    true_error, learned_error
-                  standard errors of those means, known where a learned return may be
+    regret_error, gap_error
+                  standard errors of the differences to the expert, of the true and of the learned
+                  returns, over episodes from the same start states; known of retrained policies
     episodes      their number
     evaluation    id of the artefact
 """
@@ -33,7 +34,7 @@ from irlcli.data.descriptions import Assessment, Interval, Measured
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, comparisons
 from irlcli.report.lineage import evaluations, is_mixed, origins
 from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
-from irlcli.report.reward_quality import Judgement, difference, judge
+from irlcli.report.reward_quality import Judgement, judge
 from irlcli.report.statistics import compare, holm, paired_p, summarise
 
 # A student imitates if its return is within a fifth of its expert's, in every training setting.
@@ -48,7 +49,7 @@ _DIAGNOSTICS = (
     "penalty_weight",
 )
 
-_SCORED = ["true_return", "true_error", "learned_return", "learned_error"]
+_SCORED = ["true_return", "learned_return", "regret_error", "gap_error"]
 
 Learning = Mapping[tuple[str, str, int], pd.DataFrame]
 Assessments = Mapping[tuple[str, str, int | None], Assessment]
@@ -276,10 +277,11 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     setting's expert; ``short``, the policies that fall short of the expert, and
     ``short_scored_higher``, those of them because of a wrong reward: see
     :func:`irlcli.report.reward_quality.judge`, which also needs the random agent's return;
-    ``uncertain``, the verdicts that rest on differences within two standard errors.
+    ``uncertain``, the verdicts that rest on differences within two standard errors, and
+    ``short_uncertain``, those of them on policies that fall short.
     """
     columns = ["row", "agent", "seeds", "judged", "retrained", "expert"]
-    columns += ["short", "short_scored_higher", "uncertain"]
+    columns += ["short", "short_scored_higher", "uncertain", "short_uncertain"]
     found = []
     for row in p.rows if "transfer" in p.measures else ():
         random = sample(points, row.name, "random", "ood")["true_return"].mean()
@@ -288,8 +290,8 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                 points_of(points, row.name, method, m).dropna(subset="learned_return")
                 for m in ("transfer", EXPERT_BY_REWARD)
             )
-            policies = policies[["seed", *_SCORED]]
-            both = policies.merge(experts, on="seed", suffixes=("", "_expert"))
+            experts = experts[["seed", "true_return", "learned_return"]]
+            both = policies[["seed", *_SCORED]].merge(experts, on="seed", suffixes=("", "_expert"))
             if both.empty or math.isnan(random):
                 continue
             every = (_judged(pair, random) for pair in both.itertuples())
@@ -301,6 +303,7 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                 len(verdicts) - verdicts.count("retrained"),
                 verdicts.count("wrong reward"),
                 sum(not judgement.clear for judgement in judged),
+                sum(not j.clear for j in judged if j.verdict != "retrained"),
             )
             seeds = both["seed"].nunique()
             found.append((row.name, method, seeds, len(verdicts), *means, *counts))
@@ -352,13 +355,9 @@ def _judged(pair: Any, random: float) -> Judgement:
         return Measured(mean=float(mean), error=None if pd.isna(error) else float(error))
 
     return judge(
-        known(pair.true_return, pair.true_error),
-        known(pair.true_return_expert, pair.true_error_expert),
-        Measured(mean=random, error=None),
-        difference(
-            known(pair.learned_return_expert, pair.learned_error_expert),
-            known(pair.learned_return, pair.learned_error),
-        ),
+        known(pair.true_return_expert - pair.true_return, pair.regret_error),
+        pair.true_return_expert - random,
+        known(pair.learned_return_expert - pair.learned_return, pair.gap_error),
     )
 
 

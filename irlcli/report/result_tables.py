@@ -54,7 +54,7 @@ _LEARNED_NOTE = (
     "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
     "discounts), mean over seeds; of the policy retrained on that reward, and of the held-out "
     "setting's expert. Short: policies with a regret of more than 10 % of what the "
-    "expert earns above the random agent; - beside an expert no better than the random agent. Scored higher: those of them that the reward scores at least "
+    "expert earns above the random agent; - if the expert is no better than the random agent. Scored higher: those of them that the reward scores at least "
     "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
     "show that the reward is right. Uncertain: verdicts on differences within two standard errors of the "
     "episodes. Both are scored under the transfer.ceiling that the policy was "
@@ -104,7 +104,7 @@ _BUDGET_NOTE = (
     "Steps: the budget in whole rounds; the steps of challengers are not counted. "
     "Demonstrations: episodes per training setting. Lambda: the penalty's weight; by method "
     "where the table has its own, by method and seed where it was chosen by leaving a setting "
-    "out. Kept: the round, or of how many rounds the mean. At most: training could end earlier by "
+    "out. Kept: the round, or the number of rounds averaged. At most: training could end earlier by "
     "airl.plateau_rounds; `stopped_after` in reward.json is the round."
 )
 _COST_NOTE = (

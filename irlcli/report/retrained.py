@@ -1,4 +1,4 @@
-"""How policies do that were trained on the frozen rewards: by training setting, and from the student.
+"""Returns of policies trained on the frozen rewards: by training setting, and from the student.
 
 Points are those of :mod:`irlcli.report.compute`.
 """

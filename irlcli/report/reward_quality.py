@@ -70,12 +70,6 @@ def measured(sample: np.ndarray) -> Measured:
     return Measured(mean=float(sample.mean()), error=error)
 
 
-def difference(x: Measured, y: Measured) -> Measured:
-    """x - y of independent samples."""
-    errors = [m.error for m in (x, y) if m.error is not None]
-    return Measured(mean=x.mean - y.mean, error=math.hypot(*errors) if len(errors) == 2 else None)
-
-
 # Correlations
 
 
@@ -149,7 +143,8 @@ def agreement(members: Sequence[Member], lower: bool = False) -> Agreement:
     part = max(1, RESAMPLED_AT_ONCE // (present.size * episodes))
     for start in range(0, _RESAMPLES, part):
         end = min(start + part, _RESAMPLES)
-        at_random = rng.integers(episodes, size=(end - start, *shape, episodes))
+        # The same episodes of every policy: episode k starts from the same state for all of them.
+        at_random = rng.integers(episodes, size=(end - start, 1, 1, episodes))
         for of, values in zip(means, (true, learned), strict=True):
             of[start:end] = np.take_along_axis(values[None], at_random, -1).mean(-1)
     # A policy that is drawn twice has the same episodes both times. Two draws of them would differ
@@ -193,7 +188,7 @@ def return_distance(members: Sequence[Member]) -> float | None:
 # What a retrained policy fell short of
 
 
-def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -> Judgement:
+def judge(regret: Measured, margin: float, gap: Measured) -> Judgement:
     """Why a retrained policy does not earn what the expert earns, if it does not.
 
     None where the expert earns no more than the random agent. ``retrained``: its regret is within
@@ -202,13 +197,13 @@ def judge(policy: Measured, expert: Measured, random: Measured, gap: Measured) -
     reward still offers more.
 
     Args:
-        policy, expert, random: true returns.
+        regret: true return of the expert minus the policy's.
+        margin: true return of the expert minus the random agent's.
         gap: learned return of the expert minus the policy's.
     """
-    if expert.mean <= random.mean:
+    if margin <= 0.0:
         return Judgement(None, False)
-    regret = difference(expert, policy)
-    beyond = regret.mean - ALLOWED_REGRET * (expert.mean - random.mean)
+    beyond = regret.mean - ALLOWED_REGRET * margin
     if beyond <= 0.0:
         return Judgement("retrained", _is_clear(beyond, regret))
     verdict: Verdict = "wrong reward" if gap.mean <= 0.0 else "optimisation fell short"
@@ -223,15 +218,16 @@ def split_regret(policy: Member, expert: Member, random: Member) -> RegretSplit:
     """The true regret of a retrained policy beside the gap of its learned return to the expert.
 
     Learned returns are those that the policy was trained for: under its ceiling, if it has one.
+    Standard errors are of paired differences, because episode k starts from the same state for all.
     """
-    earned, best, worst = (measured(m.true) for m in (policy, expert, random))
     bounded = policy.learned if policy.bounded is None else policy.bounded
     expert_bounded = expert.learned if policy.expert_bounded is None else policy.expert_bounded
-    gap = difference(measured(expert_bounded), measured(bounded))
-    verdict, clear = judge(earned, best, worst, gap)
+    regret, gap = measured(expert.true - policy.true), measured(expert_bounded - bounded)
+    margin = float(expert.true.mean() - random.true.mean())
+    verdict, clear = judge(regret, margin, gap)
     return RegretSplit(
         policy=policy.policy,
-        true_regret=difference(best, earned),
+        true_regret=regret,
         learned_gap=gap,
         verdict=verdict,
         clear=clear,

@@ -6,6 +6,7 @@ Every function is pure: arrays in, numbers out. A number that is not defined is 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -128,7 +129,9 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
     found = replace(found, rank=rank, improvement=improvement)
     if not np.ptp(a) and not np.ptp(b):
         return replace(found, why="all seeds are equal, so the variance is zero")
-    welch, student = (stats.ttest_ind(a, b, equal_var=v) for v in (False, True))
+    # scipy warns if one sample is constant. The tests are defined all the same.
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
+        welch, student = (stats.ttest_ind(a, b, equal_var=v) for v in (False, True))
     low, high = map(float, welch.confidence_interval(0.95))
     return replace(
         found,

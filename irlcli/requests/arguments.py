@@ -216,7 +216,7 @@ def check_env(ref: str, learned: str, wanted: str | None) -> None:
     if wanted is not None and wanted != learned:
         raise UsageError(
             f"{ref!r} belongs to {learned}, not to {wanted}",
-            "omit --env; a copy of an environment's file is another environment unless it sets the same name",
+            "omit --env; a copy of an environment's file is a new environment unless both set the same name in [env]",
         )
 
 

@@ -65,8 +65,8 @@ def train_airl(
     }
     config = session.config(env, flags)
     airl = config.airl_of(settings)
-    arguments.check_weighted(airl_stage.name(airl), METHODS, airl.penalty, penalty_weight)
-    arguments.warn_of_weight(session.console, airl_stage.name(airl), airl)
+    arguments.check_weighted(airl_stage.method_of(airl), METHODS, airl.penalty, penalty_weight)
+    arguments.warn_of_weight(session.console, airl_stage.method_of(airl), airl)
     basis: dict[str, Source] = {}
     if choose_penalty is not None:
         # A bad option must fail before the choice of lambda, which takes long.

@@ -59,11 +59,11 @@ class Learner(Protocol):
         index: int,
         rollouts: Sequence[Rollout],
         policy: Policy,
-        challenge: Sequence[Rollout],
+        challenger_rollouts: Sequence[Rollout],
     ) -> list[dict[str, float]]:
         """Learn from the rollouts of round ``index``; diagnostics, one dict per setting.
 
-        ``challenge`` are the rollouts of a challenger, if there is one.
+        ``challenger_rollouts`` are the rollouts of a challenger, if there is one.
         """
 
     def state_dict(self) -> State:
@@ -163,18 +163,20 @@ class Training:
             if until is not None and self.steps >= until:
                 return self.rows
             rollouts = self.trainer.train_round(index, self.source)
-            challenge = [] if self.challengers is None else self.challengers.train_round(index)
+            challenger_rollouts = (
+                [] if self.challengers is None else self.challengers.train_round(index)
+            )
             policy = self.trainer.policy
             diagnostics: list[dict[str, float]] = [{}] * len(self.settings)
             if self.learner is not None:
-                diagnostics = self.learner.update(index, rollouts, policy, challenge)
+                diagnostics = self.learner.update(index, rollouts, policy, challenger_rollouts)
             score = {} if self.selector is None else self.selector.consider(index, policy)
             rows = [
                 row | of_setting | of_challenger | score
                 for row, of_setting, of_challenger in zip(
                     episode_rows(index, self.trainer.steps, rollouts, self.settings),
                     diagnostics,
-                    self._of_challenger(index, challenge),
+                    self._of_challenger(index, challenger_rollouts),
                     strict=True,
                 )
             ]
@@ -182,7 +184,7 @@ class Training:
             self.rounds_done = index + 1
             for message in (
                 *self._errors(index, rollouts, "world"),
-                *self._errors(index, challenge, "the challenger's world"),
+                *self._errors(index, challenger_rollouts, "the challenger's world"),
             ):
                 warn(message)
             after_round(self, rows)
@@ -190,16 +192,16 @@ class Training:
             self.selector.restore(self.trainer.policy)
         return self.rows
 
-    def _of_challenger(self, index: int, challenge: Sequence[Rollout]) -> list[Row]:
+    def _of_challenger(self, index: int, challenger_rollouts: Sequence[Rollout]) -> list[Row]:
         """What the challenger of round ``index`` earned in each setting, by the true reward."""
-        if not challenge:
+        if not challenger_rollouts:
             return [{} for _ in self.settings]
         return [
             {
                 "challenger_return": row["true_return"],
                 "challenger_progress": row["progress"],
             }
-            for row in episode_rows(index, self.trainer.steps, challenge, self.settings)
+            for row in episode_rows(index, self.trainer.steps, challenger_rollouts, self.settings)
         ]
 
     def _errors(self, index: int, rollouts: Sequence[Rollout], whose: str) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """PPO (Schulman et al. 2017), as stable-baselines3 implements it, trained in seeded rounds.
 
-Of what a config does not set, only Adam's eps differs from stable-baselines3's, see
+What a config does not set is as in stable-baselines3, except for Adam's eps, see
 :class:`irlcli.configs.PPOConfig`.
 
 A round seeds every generator from (purpose, seed, round), starts fresh episodes, collects one or

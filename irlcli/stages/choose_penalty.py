@@ -64,7 +64,7 @@ def request(
     parameters = Parameters(
         environment=environment_key(env, settings), settings=texts, weights=candidates, seed=seed
     )
-    label = f"choose-penalty {train_airl.name(airl)} {env} {', '.join(texts)} seed {seed}"
+    label = f"choose-penalty {train_airl.method_of(airl)} {env} {', '.join(texts)} seed {seed}"
     return Request(STAGE, parameters, inputs, label)
 
 
@@ -88,7 +88,7 @@ def _candidates(
         )
     if (penalty.compares or airl.grouping == "shuffled") and len(settings) < 3:
         raise UsageError(
-            f"--choose-penalty leaves a setting out, and {train_airl.name(airl)} needs at least two "
+            f"--choose-penalty leaves a setting out, and {train_airl.method_of(airl)} needs at least two "
             f"of the others: {len(settings)} settings are too few",
             "set lambda instead of choosing it, or train in three settings or more",
         )

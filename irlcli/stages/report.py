@@ -7,7 +7,6 @@ how long, at which commit) are parameters, so that equal requests give equal byt
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, Parameters
@@ -87,7 +86,7 @@ def _points(job: Job) -> list[dict[str, Any]]:
         summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
         scored = cell.measure in ("transfer", EXPERT_BY_REWARD)
         of_expert = cell.agent in ("expert", "reused") or cell.measure == EXPERT_BY_REWARD
-        errors = _errors(job.inputs[cell.role] / "episodes.parquet") if scored else {}
+        errors = _errors(job, cell) if cell.measure == "transfer" else {}
         points += [
             {
                 "row": cell.row,
@@ -100,8 +99,8 @@ def _points(job: Job) -> list[dict[str, Any]]:
                 "true_return": place.mean_return,
                 "progress": place.mean_progress,
                 "learned_return": place.mean_learned_return if scored else None,
-                "true_error": errors.get((place.setting, "true_return")),
-                "learned_error": errors.get((place.setting, "learned_return")),
+                "regret_error": errors.get((place.setting, "true_return")),
+                "gap_error": errors.get((place.setting, "learned_return")),
                 "episodes": place.episodes,
                 "evaluation": cell.run,
             }
@@ -110,13 +109,34 @@ def _points(job: Job) -> list[dict[str, Any]]:
     return points
 
 
-def _errors(path: Path) -> dict[tuple[str, str], float]:
-    """Standard errors of the mean returns in an evaluation's ``episodes.parquet``, by setting and kind."""
+def _errors(job: Job, cell: Cell) -> dict[tuple[str, str], float]:
+    """Standard errors of a retrained policy's mean differences to the expert, by setting and return.
+
+    The differences are of episodes from the same start state.
+    """
     import pandas as pd
 
-    frame = pd.read_parquet(path)
-    kinds = [kind for kind in ("true_return", "learned_return") if kind in frame]
-    return frame.groupby("setting")[kinds].sem().stack().to_dict()
+    experts = (
+        other.role
+        for other in _filled(job.parameters)
+        if other.measure == EXPERT_BY_REWARD
+        and (other.row, other.agent, other.seed) == (cell.row, cell.agent, cell.seed)
+    )
+    role = next(experts, None)
+    if role is None:
+        return {}
+    policy, expert = (
+        pd.read_parquet(job.inputs[r] / "episodes.parquet").set_index(
+            ["setting", "episode", "seed"]
+        )
+        for r in (cell.role, role)
+    )
+    kinds = [
+        kind for kind in ("true_return", "learned_return") if kind in policy and kind in expert
+    ]
+    # An episode that only one of them has is undefined, and sem() omits it.
+    differences = expert[kinds] - policy[kinds]
+    return differences.groupby("setting").sem().stack().to_dict()
 
 
 def _episodes(job: Job) -> caveats.Episodes:
@@ -195,4 +215,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 32, run)
+STAGE = Stage("report", 33, run)

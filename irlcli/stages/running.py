@@ -46,8 +46,9 @@ def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
         first = newest[0]["round"] == 0 and not newest[0].get("restart")
         if first and all(isnan(row["true_return"]) for row in newest):
             job.console.warn(
-                "no episode ended in the first round. A round begins with new episodes, so if all are "
-                "longer, nothing is learned about their later steps: raise n_steps or rollouts_per_round"
+                "no episode ended in the first round. Every round starts new episodes, so nothing is learned "
+                "about the steps of an episode after the end of its round: raise n_steps or "
+                "rollouts_per_round"
             )
         job.checkpoints.offer(encoded)
 

@@ -101,7 +101,9 @@ def _relevant(airl: AIRLConfig, env: str, trained: int) -> AIRLConfig:
     relevant = relevant_airl(airl, spec.discrete_actions, spec.terminates)
     _check_rounds(relevant)
     if trained == 1:
-        relevant = replace(relevant, challenger=replace(relevant.challenger, per_setting=UNSET))
+        # There is nothing to share, and no other setting to draw from.
+        challenger = replace(relevant.challenger, per_setting=UNSET)
+        relevant = replace(relevant, challenger=challenger, pairing=AIRLConfig().pairing)
     if relevant.challenger.per_setting is True:
         # Each challenger has a share of the worlds.
         share = replace(relevant.challenger.ppo, n_envs=airl.ppo.n_envs // trained)
@@ -115,7 +117,7 @@ def _relevant(airl: AIRLConfig, env: str, trained: int) -> AIRLConfig:
     return relevant
 
 
-def name(airl: AIRLConfig) -> str:
+def method_of(airl: AIRLConfig) -> str:
     """The method's name."""
     return method_name(msgspec.structs.asdict(airl))
 
@@ -216,7 +218,15 @@ def run(job: Job) -> None:
                 theirs = [worlds_of([setting], share) for setting in parsed]
             challengers = Challengers(theirs, airl.challenger, learner, p.seed, STAGE.name)
         stop = _at_a_plateau(airl, len(settings))
-        training = Training(trainer, learner, settings, learner, selector, challengers, stop)
+        training = Training(
+            trainer,
+            source=learner,
+            settings=settings,
+            learner=learner,
+            selector=selector,
+            challengers=challengers,
+            ends=stop,
+        )
         rows = run_training(job, training)
     if learner.scale <= SMALLEST_SCALE:
         job.console.warn("g is constant on the training data: no policy can be trained on it")
@@ -224,7 +234,7 @@ def run(job: Job) -> None:
     origin = {
         "env": env,
         "settings": settings,
-        "method": name(airl),
+        "method": method_of(airl),
         "seed": p.seed,
     }
     write_policy(job.output, trainer.policy, airl.ppo, agent="student", **origin)

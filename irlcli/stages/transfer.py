@@ -87,7 +87,7 @@ def run(job: Job) -> None:
     from irlcli.seeds import derive
 
     p: Parameters = job.parameters
-    env, config = p.environment.name, p.transfer.trained_by
+    env, config = p.environment.name, p.transfer.algorithm_config
     settings = [parse_setting(env, p.setting)]
     model, origin = load_reward_file(job.inputs["reward"])
     student = None

@@ -234,7 +234,9 @@ def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, m
     table = pq.read_table(exported)
     names = np.array(table["setting"].to_pylist())
     first = int(np.argmax(names == "engine-power=1.25x"))
-    refused = f"row {first} is of engine-power=1.25x, as its 'setting' says, not of engine-power=1x"
+    refused = (
+        f"row {first}: 'setting' says engine-power=1.25x, but the command names engine-power=1x"
+    )
     one = [*LANDER[:3], "engine-power=1x"]
     assert_answered(irl("import", exported, *one, *store), 2, refused)
     # In every type that text has in Arrow.
@@ -247,10 +249,10 @@ def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, m
     for text in ("1.25x", "1x"):
         parts.append(tmp_path / f"{text}.parquet")
         pq.write_table(table.filter(pa.array(names == f"engine-power={text}")), parts[-1])
-    assert_answered(irl("import", *parts, *LANDER, *store), 2, "1.25x.parquet row 0 is of")
+    assert_answered(irl("import", *parts, *LANDER, *store), 2, "1.25x.parquet row 0: ")
     imported(irl, store_copy, *reversed(parts), *LANDER)
     assert irl("export", "demos", "demos", "--to", "minari:me/all-v0", *store[:2]).code == 0
-    assert_answered(irl("import", "minari:me/all-v0", *one, *store), 2, "is of engine-power=1.25x")
+    assert_answered(irl("import", "minari:me/all-v0", *one, *store), 2, "says engine-power=1.25x")
     # In a foreign source the word may mean anything.
     other = table.drop_columns(["setting"])
     foreign = pa.array(["1.25x" if i % 2 else "expert" for i in range(len(other))])

@@ -173,7 +173,7 @@ WRONG = [
     (f"evaluate --expert --trained-in bounce {LANDER} --name both", 2, "'both'"),
     ("evaluate --policy airl --ood 2x --intervention bounce=1", 2, "--ood and --intervention"),
     (f"evaluate --expert {LANDER},1.25x --name both", 2, "'both'"),
-    ("run demo --cluster slurm --detach --out found", 2, "--detach makes no report"),
+    ("run demo --cluster slurm --detach --out found", 2, "--detach waits for none"),
     # References of the wrong kind
     ("transfer --reward moved/policy.pt --ood 2x", 2, "'moved/policy.pt'"),
     ("transfer --reward airl/policy.pt --ood 2x", 2, "'airl/policy.pt'"),

@@ -115,10 +115,15 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
         assert list(chosen["evaluation"].astype(str)) == [artefact.id]
         (place,) = summary["settings"]
         assert chosen["true_return"].item() == pytest.approx(place["mean_return"], rel=1e-5)
-        episodes = pd.read_parquet(artefact.directory / "episodes.parquet")
-        for kind in ("true", "learned") if measure == "transfer" else ():
-            error = episodes[f"{kind}_return"].std() / len(episodes) ** 0.5
-            assert chosen[f"{kind}_error"].item() == pytest.approx(error, rel=1e-4)
+        if measure == "transfer":
+            own = pd.read_parquet(artefact.directory / "episodes.parquet")
+            expert = store.resolve(f"{agent}.{seed}.expert").artefact
+            theirs = pd.read_parquet(expert.directory / "episodes.parquet")
+            assert own["seed"].tolist() == theirs["seed"].tolist()
+            for kind, column in (("true", "regret_error"), ("learned", "gap_error")):
+                gaps = theirs[f"{kind}_return"] - own[f"{kind}_return"]
+                error = gaps.std() / len(gaps) ** 0.5
+                assert chosen[column].item() == pytest.approx(error, rel=1e-4)
     in_distribution = points[(points["measure"] == "id") & (points["agent"] == "irm")]
     assert sorted(set(in_distribution["setting"])) == ["engine-power=1.25x", "engine-power=1x"]
 

@@ -294,7 +294,7 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     for command in ("report", "run"):
         assert "has a README.md" in refused(command, "demo", "--out", tmp_path)
         assert "--out" in refused(command, "demo", "--out", "")
-    assert "--until makes no report" in refused("run", "demo", "--until", "demos", "--out", "x")
+    assert "--until stops before it" in refused("run", "demo", "--until", "demos", "--out", "x")
     for command in ("plan", "run"):
         both = refused(command, "demo", "--only", "x", "--until", "demos")
         assert "--only takes no --until" in both

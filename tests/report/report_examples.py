@@ -64,8 +64,8 @@ def example(values, **more):
                         "true_return": value,
                         "progress": None,
                         "learned_return": None,
-                        "true_error": None,
-                        "learned_error": None,
+                        "regret_error": None,
+                        "gap_error": None,
                         "episodes": 20,
                         "evaluation": id16,
                     }

@@ -78,7 +78,7 @@ def test_a_saturated_discriminator_without_cross_entropy():
 
 def test_a_page_with_shares_and_verdicts_says_that_they_are_measured_differently():
     def told(report):
-        return [c for c in report.caveats if c.startswith("Two yardsticks")]
+        return [c for c in report.caveats if c.startswith("Two criteria")]
 
     pairs = {(BOUNCE, "erm"): [(9, 10), (9, 10), (9, 10)]}
     (line,) = told(scored(pairs))

@@ -107,7 +107,7 @@ def test_learned_returns_rank_policy_and_expert():
         {
             **{"row": BOUNCE, "agent": agent, "seeds": 3, "judged": 3},
             **{"retrained": policy, "expert": expert, "short": 3, "short_scored_higher": higher},
-            "uncertain": 3,
+            **{"uncertain": 3, "short_uncertain": 3},
         }
         for agent, policy, expert, higher in (("erm", 6.0, 4.0, 2), ("irm", 1.0, 5 / 3, 1))
     ]
@@ -146,9 +146,9 @@ def test_beside_an_expert_no_better_than_random_none_is_judged():
     assert not any(c.startswith("Short of") for c in report.caveats)
 
 
-@pytest.mark.parametrize(("error", "uncertain"), [(None, 3), (3.0, 0), (4.0, 1), (20.0, 2)])
+@pytest.mark.parametrize(("error", "uncertain"), [(None, 3), (4.0, 0), (6.0, 1), (30.0, 2)])
 def test_verdicts_within_two_standard_errors_are_uncertain(error, uncertain):
-    """Learned returns of the expert are higher by 10, 20 and 100; the error of each is sqrt(2) times its own."""
+    """Learned returns of the expert are higher by 10, 20 and 100."""
     values = complete() | {(BOUNCE, "erm", EXPERT_BY_REWARD): [250.0] * 3}
     p, points = example(values)
     mine = (
@@ -156,9 +156,23 @@ def test_verdicts_within_two_standard_errors_are_uncertain(error, uncertain):
     )
     points.loc[mine, "learned_return"] = [90.0, 80.0, 0.0]
     points.loc[points["measure"] == EXPERT_BY_REWARD, "learned_return"] = 100.0
-    points[["true_error", "learned_error"]] = error
+    points[["regret_error", "gap_error"]] = error
     (found,) = build(p, points, {}, {}).learned_returns.itertuples()
-    assert (found.short, found.uncertain) == (3, uncertain)
+    assert (found.short, found.uncertain, found.short_uncertain) == (3, uncertain, uncertain)
+
+
+def test_only_policies_that_fall_short_count_as_uncertain_in_the_caveat():
+    """Regrets of 45, 46 and 200, of which 45 are allowed: the first is no caveat, however uncertain."""
+    values = complete() | {(BOUNCE, "erm", EXPERT_BY_REWARD): [250.0] * 3}
+    values[BOUNCE, "erm", "transfer"] = [205.0, 204.0, 50.0]
+    p, points = example(values)
+    points["learned_return"] = (points["measure"] == EXPERT_BY_REWARD) * 100.0
+    points[["regret_error", "gap_error"]] = 1.0
+    report = build(p, points, {}, {})
+    (found,) = report.learned_returns.itertuples()
+    assert (found.short, found.uncertain, found.short_uncertain) == (2, 2, 1)
+    (caveat,) = (c for c in report.caveats if c.startswith("Short of"))
+    assert "2 of 3" in caveat and caveat.endswith("standard errors): 1.")
 
 
 def test_every_retrained_policy_of_a_reward_is_judged():

@@ -59,14 +59,17 @@ def test_intervals_resample_episodes_and_keep_their_two_returns_together():
     """Two policies: the correlation is 1 or -1 in each resample."""
     noise = np.array([-9.0, 9.0, -8.0, 8.0])
 
-    def low(true):
+    def low(true, learned):
         members = [
-            Member(f"{i}", "clone", "e", i + true, i + noise, np.ones(4)) for i in (0.0, 1.0)
+            Member(f"{i}", "clone", "e", i + t, i + x, np.ones(4))
+            for i, (t, x) in enumerate(zip(true, learned, strict=True))
         ]
         return agreement(members).pearson.low
 
-    assert low(0.0 * noise) == pytest.approx(-1.0)
-    assert low(noise) == pytest.approx(1.0)
+    assert low((0 * noise, 0 * noise), (noise, -noise)) == pytest.approx(-1.0)
+    assert low((noise, -noise), (noise, -noise)) == pytest.approx(1.0)
+    # What the start state adds to every policy's return does not change their order.
+    assert low((0 * noise, 0 * noise), (noise, noise)) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -204,14 +207,11 @@ def known(mean, error=1.0):
     return Measured(mean=mean, error=error)
 
 
-EXPERT, RANDOM = known(100.0), known(0.0)
-
-
 @pytest.mark.parametrize(
     ("earned", "gap", "verdict", "clear"),
     [
         (99.0, -50.0, "retrained", True),
-        (91.0, 50.0, "retrained", False),  # regret 9 of the 10 allowed, deviation 1.4
+        (91.0, 50.0, "retrained", False),  # regret 9 of the 10 allowed, error 1
         (50.0, -50.0, "wrong reward", True),
         (50.0, 0.0, "wrong reward", False),
         (50.0, 50.0, "optimisation fell short", True),
@@ -221,20 +221,33 @@ EXPERT, RANDOM = known(100.0), known(0.0)
     ],
 )
 def test_the_verdict_on_a_retrained_policy(earned, gap, verdict, clear):
-    assert judge(known(earned), EXPERT, RANDOM, known(gap)) == (verdict, clear)
+    assert judge(known(100.0 - earned), 100.0, known(gap)) == (verdict, clear)
 
 
 def test_the_allowed_regret_is_a_tenth_of_what_the_expert_earns_above_random():
     """Of an expert at 100 and a random agent at -900: 100."""
-    low = known(-900.0)
-    assert judge(known(1.0), EXPERT, low, known(1.0)).verdict == "retrained"
-    assert judge(known(-1.0), EXPERT, low, known(1.0)).verdict != "retrained"
+    assert judge(known(99.0), 1000.0, known(1.0)).verdict == "retrained"
+    assert judge(known(101.0), 1000.0, known(1.0)).verdict != "retrained"
 
 
-@pytest.mark.parametrize("random", [100.0, 500.0])
-def test_beside_an_expert_no_better_than_random_there_is_no_verdict(random):
-    for earned in (99.0, 101.0):
-        assert judge(known(earned), EXPERT, known(random), known(1.0)) == (None, False)
+@pytest.mark.parametrize("margin", [0.0, -400.0])
+def test_beside_an_expert_no_better_than_random_there_is_no_verdict(margin):
+    for regret in (1.0, -1.0):
+        assert judge(known(regret), margin, known(1.0)) == (None, False)
+
+
+def test_episodes_from_one_start_are_compared_with_each_other():
+    """Start states decide nearly all of both returns: the policy loses 20 or 22 in each of four."""
+    start, loss = np.array([0.0, 300.0, 600.0, 900.0]), np.array([20.0, 22.0, 20.0, 22.0])
+    expert = Member("expert", "expert", "e", start, start, np.ones(4))
+    policy = Member("retrained", "retrained", "e", start - loss, start + loss, np.ones(4))
+    random = Member("random", "random", "e", np.full(4, 350.0), np.zeros(4), np.ones(4))
+    split = split_regret(policy, expert, random)
+    error = np.std([20, 22, 20, 22], ddof=1) / 2
+    assert split.true_regret == Measured(mean=21.0, error=pytest.approx(error))
+    assert split.learned_gap == Measured(mean=-21.0, error=pytest.approx(error))
+    # 21 of the 10 allowed, clear for pairs only: each return has a standard error of 194.
+    assert (split.verdict, split.clear) == ("wrong reward", True)
 
 
 def test_a_single_episode_has_no_standard_error():

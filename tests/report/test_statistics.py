@@ -46,6 +46,14 @@ def test_the_papers_p_values_are_students_and_by_welch_two_exceed_5_percent():
     assert found["ant", "friction"].difference == pytest.approx(783.9 - 542.7)
 
 
+@pytest.mark.filterwarnings("error")
+def test_one_constant_sample_is_compared_without_warnings():
+    found = compare([1.0, 1.0], [1.0, 2.0])
+    # Both tests: t = -0.5 / 0.5, with one (Welch) and two degrees of freedom.
+    assert found.welch == pytest.approx(0.5)
+    assert found.student == pytest.approx(1 - 1 / 3**0.5)
+
+
 @given(returns.filter(lambda v: len(set(v)) > 1), returns.filter(lambda v: len(v) > 1))
 def test_tests_are_scipys(x, y):
     found = compare(x, y)

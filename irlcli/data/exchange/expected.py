@@ -82,7 +82,7 @@ class Expected:
             return
         if not same(found, parse_setting(self.env, only)):
             raise UsageError(
-                f"{place} is of {found}, as its {SETTING!r} says, not of {only}",
+                f"{place}: {SETTING!r} says {found}, but the command names {only}",
                 "name the settings that the source holds, or rename that column",
             )
 
