@@ -1,4 +1,4 @@
-# make demo       train, learn a reward and retrain on it in LunarLander: the whole chain, in minutes
+# make demo       learn a reward and retrain on it in LunarLander: the whole chain, in minutes
 # make test       the tests              make lint   ruff and mypy
 # make table1     a table of the paper: missing experts, rewards, retrained policies and returns are
 #                 made, then the report. Also figure2 figure3 figure4 table2 experts gates
@@ -16,11 +16,13 @@
 #   SET="--set FIELD=VALUE"          other hyperparameters; needs a TAG
 #   CHOOSE="--choose-penalty 1,10"   lambda by leaving a setting out; needs a TAG
 #   TAG=NAME                         what the artefacts' names begin with; by default the profile
+#                                    (demo, control-airl-5, table1-5: the table's name)
 #   JOBS=2                           processes at a time; Slurm's jobs are not limited by it
 #   CLUSTER=slurm PARTITION=P TIME=4:00:00 CPUS=1   jobs of a cluster instead (docs/cluster.md)
 #   STORE=DIR                        artefact store; by default IRL_STORE or runs
 #   FROM=DIR                         store to copy from what it holds, or a URL; FROM= trains everything
-#   RESULTS=DIR                      where a report's files go; by default results/TAG/TARGET
+#   RESULTS=DIR                      where a report's files go; by default results/TAG/TARGET, with
+#                                    the chosen rows, methods and seeds
 #
 # Every target can be interrupted and run again: what exists is kept, what was interrupted resumes.
 
