@@ -94,7 +94,7 @@ def imported(what: str, place: str) -> Any:
 
     try:
         return resolve_name(place if ":" in place else f"{place}:")
-    except (ModuleNotFoundError, AttributeError) as error:
+    except (ImportError, AttributeError, SyntaxError) as error:
         raise StageFailed(
             f"{what}: {place} cannot be imported ({error})",
             "install its package, or name its folder in PYTHONPATH; or correct the registered name",

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import reprlib
 from numbers import Real
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from irlcli.store import Store
+from irlcli.store import Store, store_around
 
 if TYPE_CHECKING:
     from gymnasium import Space
@@ -151,7 +153,7 @@ class LearnedReward:
 
 
 def load_reward(
-    ref: str | Path,
+    ref: str | PathLike[str],
     store: str | Path = "runs",
     *,
     env: str | None = None,
@@ -162,9 +164,9 @@ def load_reward(
     """The learned reward that ``ref`` names.
 
     Args:
-        ref: name, id or id prefix of an artefact of ``irl train-airl``, or a path to a
-            ``reward.pt``.
-        store: where artefacts are looked up.
+        ref: name, id or id prefix of an artefact of ``irl train-airl``, what ``Lab.train_airl``
+            returned, or a path to a ``reward.pt``.
+        store: where names and ids are looked up. A path is read in the store that it lies in.
         env: TOML file of the environment, for a ``reward.pt`` outside a store that was learned in
             an environment of one's own.
         setting: the setting it is to be used in, e.g. ``friction=1.5:0.1:0.1``; by default the
@@ -179,8 +181,11 @@ def load_reward(
         IrlError: ``ref`` names no reward, the reward is damaged, or it does not fit the setting.
     """
     from irlcli.envs.registry import forget, resolve
-    from irlcli.errors import UsageError
+    from irlcli.errors import IrlError, UsageError
+    from irlcli.requests.in_python import in_python
 
+    if not isinstance(ref, str | PathLike):
+        raise UsageError(f"ref {reprlib.repr(ref)} is not text or a path", "give a name or an id")
     for name, value in (("gamma", gamma), ("ceiling", ceiling)):
         if not isinstance(value, Real | None):
             raise UsageError(f"{name} {value!r} is not a number", "give a number")
@@ -193,9 +198,15 @@ def load_reward(
         raise UsageError(f"ceiling = {ceiling:g} is not a quantile", "give a number from 0 to 1")
     # Another call may have introduced another environment of the same name.
     forget()
-    if env is not None:
-        resolve(env)
-    return reward_in(Store(Path(store)), str(ref), setting, gamma, ceiling)
+    place = fspath(ref)
+    try:
+        if env is not None:
+            resolve(env)
+        home = Store(store_around(Path(place)) or Path(store))
+        return reward_in(home, place, setting, gamma, ceiling)
+    except IrlError as error:
+        error.message, error.hint = in_python(error.message), in_python(error.hint)
+        raise
 
 
 def reward_in(

@@ -89,13 +89,59 @@ def test_what_is_registered_with_a_wrong_place(irl, store_copy, monkeypatch, pla
         assert "PYTHONPATH" in done.err and "defect" not in done.err
 
 
+PENALTY = """\
+import torch
+
+
+def discriminator(samples, options):
+    return {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (
+            PENALTY.format("samples.risk.mean()"),
+            "wrong.py, line 5, raised AttributeError: 'Samples'",
+        ),
+        (
+            PENALTY.format("torch.ones(2, 3) @ torch.ones(2)"),
+            "wrong.py, line 5, raised RuntimeError",
+        ),
+        (PENALTY.format("samples.risks"), "penalty 'wrong' returned [2], not a scalar tensor"),
+        (PENALTY.format("1.5"), "penalty 'wrong' returned float, not a scalar tensor"),
+        (PENALTY.format("samples.risks.detach().max()"), "penalty 'wrong' has no gradient"),
+        (PENALTY.replace("):", ")"), "lab.wrong:discriminator cannot be imported (expected ':'"),
+        ("def penalty(samples, options): ...", "has no attribute 'discriminator'"),
+        ("from irlcli.penalties import Sample", "cannot import name 'Sample'"),
+    ],
+)
+def test_a_mistake_in_a_penalty_is_named(irl, lab, store_copy, monkeypatch, code, said):
+    (lab("risk_range.py").parent / "wrong.py").write_text(code)
+    monkeypatch.setitem(penalties.PENALTIES, "wrong", penalties.Penalty("lab.wrong", ("airl",)))
+    line = ["train-airl", "--demos", "demos", "--grouping", "per-setting", "--penalty", "wrong"]
+    done = irl(*line, "--store", store_copy.path, "--profile", "smoke", "--quiet")
+    assert done.code == 1 and said in done.err, done.err
+    assert done.err.count("error:") == 1 and "hint:" in done.err and "defect" not in done.err
+    assert not list((store_copy.path / ".work").iterdir())
+
+
+def test_an_option_that_no_penalty_can_read_is_refused(irl, store_copy, monkeypatch):
+    entry = penalties.Penalty("irlcli.penalties.irmv1", ("airl",), reads=("scaling",))
+    monkeypatch.setitem(penalties.PENALTIES, "wrong", entry)
+    line = ["train-airl", "--demos", "demos", "--grouping", "per-setting", "--penalty", "wrong"]
+    done = irl(*line, "--store", store_copy.path, "--profile", "smoke", "--dry-run")
+    assert done.code == 2 and "reads 'scaling'" in done.err and "penalty_scaling" in done.err
+
+
 def test_a_penalty_whose_module_is_missing(irl, store_copy, monkeypatch):
     entry = penalties.Penalty("nowhere.risk_range", ("airl",), compares=True, reads=())
     monkeypatch.setitem(penalties.PENALTIES, "risk-range", entry)
     line = ["train-airl", "--demos", "demos", "--grouping", "per-setting"]
     line += ["--penalty", "risk-range", "--store", store_copy.path, "--profile", "smoke"]
     done = irl(*line)
-    assert done.code == 1 and "nowhere.risk_range cannot be imported" in done.err
+    assert done.code == 1 and "nowhere.risk_range:discriminator cannot be imported" in done.err
     assert "PYTHONPATH" in done.err
     # A stage that fails leaves no output behind, and no directory without a checkpoint.
     assert not list((store_copy.path / ".work").iterdir())

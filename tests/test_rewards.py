@@ -20,7 +20,7 @@ import irlcli.envs.registration
 from irlcli.configs import AIRLConfig
 from irlcli.data.descriptions import RewardNetwork
 from irlcli.data.outputs import write_reward
-from irlcli.errors import IrlError
+from irlcli.errors import IrlError, UsageError
 from irlcli.learners.reward_model import build
 
 SPACES = {"half-cheetah": (17, 6, False), "lunar-lander": (8, 4, True)}
@@ -136,6 +136,20 @@ def test_a_name_and_an_id_are_found_in_a_store(smoke_store):
     arguments = steps("lunar-lander", 5)
     np.testing.assert_array_equal(by_name(*arguments), by_id(*arguments))
     assert by_name.method == "irm"
+    # A path is read in the store that it lies in, whatever ``store`` is.
+    directory = smoke_store.path / smoke_store.airl
+    for path in (directory, str(directory / "reward.pt")):
+        by_path = irlcli.load_reward(path, store="elsewhere")
+        np.testing.assert_array_equal(by_name(*arguments), by_path(*arguments))
+
+
+def test_errors_name_arguments_not_options(tmp_path):
+    with pytest.raises(IrlError) as caught:
+        irlcli.load_reward("irm", store=tmp_path / "none")
+    assert caught.value.hint == "name another store with store"
+    for ref in (3, None, ["irm"]):
+        with pytest.raises(UsageError, match="is not text or a path"):
+            irlcli.load_reward(ref)
 
 
 def test_what_it_cannot_use_is_named(smoke_store, tmp_path):
@@ -354,6 +368,11 @@ for count in (1, 2, 50):
     arguments = [torch.as_tensor(arrays[n][:count]) for n in ("obs", "act", "next_obs", "done")]
     numpy.testing.assert_allclose(program(*arguments).numpy(), arrays["reward"][:count], atol=1e-6)
 numpy.testing.assert_array_equal(program(*arguments).numpy(), arrays["reward"])
+if arguments[1].dtype == torch.int64:
+    for index in (-1, 4):
+        arguments[1][7] = index
+        unknown = program(*arguments).isnan()
+        assert unknown[7] and unknown.sum() == 1
 """
 
 
@@ -381,7 +400,7 @@ def test_a_reward_is_exported_once_and_only_a_reward(irl, smoke_store, tmp_path)
     for words, code, named in (
         (["airl", "--to", f"torch-export:{tmp_path}/old.pt2"], 2, "exists"),
         (["airl", "--to", "parquet:x"], 2, "'parquet:x'"),
-        (["demos", "--to", f"torch-export:{tmp_path}/x.pt2"], 3, "reward.pt"),
+        (["demos", "--to", f"torch-export:{tmp_path}/x.pt2"], 2, "reward.pt"),
     ):
         done = irl("export", "reward", *words, "--store", smoke_store.path)
         assert done.code == code and named in done.err and "hint: " in done.err, done.err

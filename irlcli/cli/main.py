@@ -74,12 +74,45 @@ def _main() -> None:
     except Exception as error:
         if hasattr(error, "format_message"):
             _fail(_usage(error))
+        place = _own_code(error)
+        if place:
+            _fail(
+                StageFailed(
+                    f"{place} raised {described(error)}",
+                    "this is code of your own: --debug shows the traceback",
+                )
+            )
         _fail(
             StageFailed(
                 f"unexpected {described(error)}",
                 "this is a defect of irl: run again with --debug and report the traceback",
             )
         )
+
+
+def _own_code(error: Exception) -> str:
+    """The line that raised ``error``, if code outside this package and Python's libraries was called.
+
+    Empty if none was.
+    """
+    import os
+    import sysconfig
+    import traceback
+
+    import irlcli
+
+    installed = (
+        sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    )
+    paths = [os.path.dirname(irlcli.__file__), *installed]
+    libraries = tuple(os.path.realpath(path) + os.sep for path in paths)
+    places = [
+        f"{frame.filename}, line {frame.lineno},"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if os.path.isfile(frame.filename)
+        and not os.path.realpath(frame.filename).startswith(libraries)
+    ]
+    return places[-1] if places else ""
 
 
 def _interrupted() -> Interrupted:

@@ -13,7 +13,7 @@ from irlcli.configs.exact import MaxEntConfig
 from irlcli.configs.schema import ADAM_EPS, AIRLConfig, Config, PPOConfig, SACConfig, TransferConfig
 from irlcli.errors import UsageError, suggest
 from irlcli.learners import LEARNERS
-from irlcli.penalties import PENALTIES, check_penalty
+from irlcli.penalties import PENALTIES, READABLE, check_penalty
 from irlcli.rl import ALGORITHMS
 
 _PPO = PPOConfig()
@@ -153,7 +153,7 @@ def _penalty(airl: AIRLConfig) -> AIRLConfig:
     else:
         # A ramp of no rounds is one of a single round.
         airl = replace(airl, penalty_ramp_rounds=max(1, airl.penalty_ramp_rounds))
-        unread = {"penalty_scaling", "penalty_estimate"} - {*PENALTIES[airl.penalty].reads}
+        unread = {*READABLE} - {*PENALTIES[airl.penalty].reads}
         airl = replace(airl, **{name: getattr(_AIRL, name) for name in unread})
     return airl
 

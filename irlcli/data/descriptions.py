@@ -431,7 +431,8 @@ def parse(value: Any, form: type[Form], source: Path | str) -> Form:
         except UsageError as error:
             raise IntegrityError(
                 f"{source}: its description names an {error.message}",
-                "if the environment is your own, name its TOML file with --env",
+                "if the environment is your own, name its TOML file with --env, or the store that the file "
+                "lies in with --store",
             ) from None
         for setting in settings:
             parse_setting(env, setting)

@@ -9,6 +9,7 @@ import numbers
 import operator
 import os
 import re
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypedDict, TypeVar
@@ -16,6 +17,7 @@ from typing import Any, ParamSpec, TypedDict, TypeVar
 from irlcli.configs.fields import MAX_COUNT
 from irlcli.configs.load import field_of
 from irlcli.errors import IrlError, UsageError, file_failure, suggest
+from irlcli.requests.in_python import in_python
 
 Overrides = Mapping[str, Any] | Sequence[str]
 
@@ -111,23 +113,7 @@ def _check_form(name: str, value: Any, forms: Sequence[str]) -> None:
     words = " or ".join(_FORMS[form][0] for form in forms if form != "None")
     quoted = "str" in forms and isinstance(value, int | float)
     hint = f'write {name}="{value}"' if quoted else f"give {words}"
-    raise UsageError(f"{name} {value!r} is not {words}", hint)
-
-
-def in_python(text: str) -> str:
-    """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
-    text = text.replace("the same command again", "the same call again")
-    text = text.replace(" or IRL_STORE", "")
-    return re.sub(
-        r"`[^`]*`|--([a-z][a-z-]*)",
-        lambda found: _argument(found[1]) if found[1] else found[0],
-        text,
-    )
-
-
-def _argument(option: str) -> str:
-    name = option.replace("-", "_")
-    return "from_" if name == "from" else name
+    raise UsageError(f"{name} {reprlib.repr(value)} is not {words}", hint)
 
 
 def words(command: str, options: Mapping[str, Any], *arguments: str) -> list[str]:

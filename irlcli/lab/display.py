@@ -14,7 +14,7 @@ from typing import Any
 
 from irlcli.cli.console import Pace, TerminalConsole, printable
 from irlcli.experiments.runner import Silent
-from irlcli.lab.arguments import in_python
+from irlcli.requests.in_python import in_python
 from irlcli.store import Artefact
 
 _SECONDS_BETWEEN_UPDATES = 0.25

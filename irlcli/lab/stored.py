@@ -41,6 +41,9 @@ class Stored:
         self.path: Path = artefact.directory
         self.stage: str = artefact.manifest.record.stage
 
+    def __fspath__(self) -> str:
+        return str(self.path)
+
     def __repr__(self) -> str:
         return f"<{self.stage} {self.path}: {labels.describe(self._artefact.manifest.record)}>"
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 
 from irlcli.configs.schema import AIRLConfig
+from irlcli.errors import StageFailed
 from irlcli.learners.pools import Minibatch, Pool, Stratum, sample_minibatch
 from irlcli.learners.reward_model import RewardModel
 from irlcli.penalties import PenaltyOptions, Samples, discriminator_penalty, loss_divisor
@@ -86,6 +87,9 @@ def discriminator_loss(
         challenger_logits: of a challenger's and the experts' samples [E, 2, B]; None: there is none.
         input_gradient: GP, the mean squared gradient of g by its input, computed when called.
         parameters: of the discriminator, see :class:`irlcli.penalties.Samples`.
+
+    Raises:
+        StageFailed: the penalty's function returned something else than a scalar with a gradient.
     """
     student_share, others = 1.0, torch.zeros(())
     if challenger_logits is not None:
@@ -109,9 +113,23 @@ def discriminator_loss(
     penalised = discriminator_penalty(config.penalty)(seen, options)
     total = student_share * risk + others
     if penalty_weight > 0.0:
+        _check_penalty(config.penalty, penalised)
         total = total + penalty_weight * penalised
         total = total / loss_divisor(config.penalty, penalty_weight)
     return Loss(total, risk.detach(), penalised.detach())
+
+
+def _check_penalty(name: str, found: object) -> None:
+    if not isinstance(found, torch.Tensor) or found.shape:
+        kind = f"{list(found.shape)}" if isinstance(found, torch.Tensor) else type(found).__name__
+        raise StageFailed(
+            f"penalty {name!r} returned {kind}, not a scalar tensor", "return one, as mean() does"
+        )
+    if not found.requires_grad:
+        raise StageFailed(
+            f"penalty {name!r} has no gradient, so it would change nothing",
+            "compute it from its Samples, without detach() or item()",
+        )
 
 
 def minibatch_loss(

@@ -53,7 +53,8 @@ class StandaloneReward(nn.Module):
 
         Args:
             observations, next_observations: [B, D] float32.
-            actions: [B, A] float32, or [B] or [B, K] int64 indices.
+            actions: [B, A] float32, or [B] or [B, K] int64 indices. The reward of an index that no
+                action has is NaN.
             terminated: [B] bool; a time limit is no termination.
             ends: False if no step terminated, which saves computing g of absorbing states. An
                 exported module has no such argument and no branch on the data.
@@ -65,4 +66,7 @@ class StandaloneReward(nn.Module):
         if self._absorbing and ends:
             final = absorbed(self.model, next_observations).clamp(max=self._ceiling)
             reward = reward + absorbing_value(final, terminated.float(), self._gamma)
+        if self.model.discrete:
+            known = vectors.sum(-1) == (len(self.model.choices) or 1)
+            reward = torch.where(known, reward, torch.nan)
         return reward / self._scale

@@ -77,6 +77,10 @@ class Occupancies(NamedTuple):
     weight: "np.ndarray"
 
 
+# The fields of ``[airl]`` that some penalties read.
+READABLE = ("penalty_scaling", "penalty_estimate")
+
+
 class Penalty(NamedTuple):
     """A penalty's module, and what the learners must know of it.
 
@@ -98,7 +102,7 @@ class Penalty(NamedTuple):
     module: str
     learners: tuple[str, ...]
     compares: bool = False
-    reads: tuple[str, ...] = ("penalty_scaling", "penalty_estimate")
+    reads: tuple[str, ...] = READABLE
     candidates: tuple[float, ...] = (1.0, 100.0, 10_000.0)
     bounded: bool = False
     additive: bool = False
@@ -155,6 +159,12 @@ def check_penalty(name: str, learner: str) -> None:
     offered = sorted(n for n, penalty in PENALTIES.items() if learner in penalty.learners)
     if name not in PENALTIES:
         raise UsageError(f"unknown penalty {name!r}", suggest(name, offered))
+    for field in PENALTIES[name].reads:
+        if field not in READABLE:
+            raise UsageError(
+                f"penalty {name!r} reads {field!r}, which is not an option of penalties",
+                suggest(field, READABLE),
+            )
     if name not in offered:
         raise UsageError(
             f"{learner} has no penalty {name!r}", f"{learner} has: {', '.join(offered)}"
@@ -204,19 +214,19 @@ def discriminator_penalty(name: str) -> "Callable[[Samples, PenaltyOptions], tor
     """The function ``discriminator`` of a penalty of adversarial learners.
 
     Raises:
-        StageFailed: its module cannot be imported.
+        StageFailed: it cannot be imported.
     """
-    return _module(name).discriminator
+    return _function(name, "discriminator")
 
 
 def occupancy_penalty(name: str) -> "Callable[[Occupancies], tuple[np.ndarray, np.ndarray]]":
     """The function ``occupancy`` of a penalty of MaxEnt IRL.
 
     Raises:
-        StageFailed: its module cannot be imported.
+        StageFailed: it cannot be imported.
     """
-    return _module(name).occupancy
+    return _function(name, "occupancy")
 
 
-def _module(name: str) -> Any:
-    return imported(f"penalty {name!r}", PENALTIES[name].module)
+def _function(name: str, function: str) -> Any:
+    return imported(f"penalty {name!r}", f"{PENALTIES[name].module}:{function}")

@@ -3,7 +3,7 @@
 from irlcli.store.artefact import Artefact, Published
 from irlcli.store.digest import canonical_json, digest, file_digest
 from irlcli.store.index import Index
-from irlcli.store.layout import DEFAULT_ROOT
+from irlcli.store.layout import DEFAULT_ROOT, store_around
 from irlcli.store.manifest import (
     KeyRecord,
     Manifest,
@@ -35,4 +35,5 @@ __all__ = [
     "directory_outputs",
     "file_digest",
     "read_json",
+    "store_around",
 ]

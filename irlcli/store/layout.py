@@ -91,6 +91,14 @@ class Layout(NamedTuple):
         return self.locks / "gc"
 
 
+def store_around(path: Path) -> Path | None:
+    """The store that holds ``path``, an artefact's directory or a file directly in one, if any does."""
+    if not path.exists():
+        return None
+    around = path.absolute().parents[:2]
+    return next((root for root in around if Layout(root).marker.is_file()), None)
+
+
 def check(layout: Layout) -> None:
     """Check that the root is a store of a known format, an empty directory, or absent.
 

@@ -266,7 +266,10 @@ def test_a_lab_takes_the_environment_from_each_artefact(bench):
     for stored in (second, reward, second):
         assert not stored.to_pandas().empty
     lab.collect_experts("cart.toml", "mass=1x,2x")
-    assert irlcli.load_reward(reward.id, "runs").settings == ("mass=1x", "mass=2x")
+    # What a method returned, and a path to its file in a store that is not named.
+    for ref in (reward.id, reward, reward.output("reward.pt").absolute()):
+        registry.forget()
+        assert irlcli.load_reward(ref).settings == ("mass=1x", "mass=2x")
     lab.evaluate(idle=True, env="cart.toml", intervention="mass=2x").to_pandas()
     lab.evaluate(policy=reward).to_pandas()
     second.to_pandas()

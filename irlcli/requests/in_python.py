@@ -1,0 +1,20 @@
+"""Errors about options, as errors about arguments."""
+
+import re
+
+
+def in_python(text: str) -> str:
+    """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
+    text = text.replace("the same command again", "the same call again")
+    text = text.replace(" or IRL_STORE", "")
+    return re.sub(
+        r"`[^`]*`|--([a-z][a-z-]*)",
+        lambda found: argument(found[1]) if found[1] else found[0],
+        text,
+    )
+
+
+def argument(option: str) -> str:
+    """``penalty_weight`` for ``penalty-weight``."""
+    name = option.replace("-", "_")
+    return "from_" if name == "from" else name
