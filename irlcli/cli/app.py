@@ -42,6 +42,7 @@ COMMANDS = {
     "show": ("artefacts", "Show an artefact: its stage, parameters, inputs and outputs."),
     "lineage": ("artefacts", "Show every artefact that an artefact was made from."),
     "name": ("artefacts", "Name an artefact, which also protects it from gc."),
+    "unname": ("artefacts", "Remove names, so that gc may remove what they protected."),
     "push": ("share", "Copy artefacts and all they were made from to a directory or URL."),
     "pull": ("share", "Copy artefacts and all they were made from out of a directory or URL."),
     "verify": ("integrity", "Check stored bytes against their digests."),

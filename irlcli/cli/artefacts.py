@@ -1,4 +1,4 @@
-"""``irl ls``, ``show``, ``lineage`` and ``name``: what is stored."""
+"""``irl ls``, ``show``, ``lineage``, ``name`` and ``unname``: what is stored."""
 
 import json
 from typing import TYPE_CHECKING, Annotated, Any
@@ -149,3 +149,18 @@ def name(
         out.print_json("name", {"name": name, "id": artefact.id})
     else:
         out.print_data(str(artefact.directory))
+
+
+@store_command
+def unname(
+    session: Session,
+    names: Annotated[list[str], typer.Argument(help="Names, or patterns: 'trial.*'.")],
+) -> None:
+    """Remove names, so that gc may remove what they protected."""
+    session.check_exists()
+    removed = session.store.remove_names(names)
+    if session.as_json:
+        out.print_json("unname", {"names": removed})
+        return
+    for name in removed:
+        out.print_data(name)

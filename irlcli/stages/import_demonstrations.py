@@ -15,6 +15,8 @@ from irlcli.stages.base import EnvironmentKey, Job, Request, Source, Stage, envi
 from irlcli.stages.running import means_of
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from irlcli.data.exchange.expected import Expected
     from irlcli.data.steps import Irregular, Steps
     from irlcli.data.streaming import Written
@@ -66,6 +68,11 @@ def request(
             f"the number of sources is {len(sources)}, that of settings {len(settings)}",
             "give one source that names the setting of each episode, or one source per setting",
         )
+    if len({source.sha256 for source in sources}) < len(sources):
+        raise UsageError(
+            "two of the sources are the same, but each is of another setting",
+            "give each setting its own recordings",
+        )
     if len(sources) > 1 and setting_column is not None:
         raise UsageError(
             f"--setting-column {setting_column}, but each of {len(sources)} sources is of one setting",
@@ -102,11 +109,11 @@ def run(job: Job) -> None:
     p: Parameters = job.parameters
     env, horizon = p.environment.name, p.environment.max_episode_steps
     settings = [parse_setting(env, text) for text in p.settings]
-    size, actions, start = _spaces(env, settings)
+    bounds, actions, start = _spaces(env, settings)
     irregular = Irregular(p.cut)
     expected = Expected(env, p.settings, p.setting_column, horizon, actions, irregular)
-    check = Check(horizon, size, actions, f"{env} {p.settings[0]}", irregular, start)
-    parts = check(_read(job.inputs, p, expected))
+    check = Check(horizon, bounds.shape[1], actions, f"{env} {p.settings[0]}", irregular, start)
+    parts = _bounded(job, check(_read(job.inputs, p, expected)), bounds)
     written = write_stream(job.output, env, settings, parts, {"imported": p.form})
     for index, text in enumerate(p.settings):
         if not (written.settings == index).any():
@@ -116,27 +123,48 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", summary)
 
 
-def _spaces(env: str, settings: Sequence[Setting]) -> tuple[int, ActionSpace, Any]:
-    """The length of an observation, the actions and their first index, the same in all settings."""
+def _bounded(job: Job, parts: Iterator[Steps], bounds: np.ndarray) -> Iterator[Steps]:
+    """``parts``, and in the end a warning of observations outside ``bounds`` [2, D]."""
+    outside = total = 0
+    for part in parts:
+        beyond = (part.observations < bounds[0]) | (part.observations > bounds[1])
+        outside, total = outside + int(beyond.any(-1).sum()), total + len(part)
+        yield part
+    if outside:
+        job.console.warn(
+            f"{outside:,} of {total:,} steps have observations outside the environment's bounds: check "
+            "their units, and that they are not normalised"
+        )
+
+
+def _spaces(env: str, settings: Sequence[Setting]) -> tuple[np.ndarray, ActionSpace, Any]:
+    """Bounds [2, D] of observations over all settings, the actions, and the first index of one."""
     from contextlib import closing
+
+    import numpy as np
+    from gymnasium.spaces import Box
 
     from irlcli.envs.adapted import first_index
     from irlcli.envs.registration import make
-    from irlcli.rl.worlds import action_space, observation_size
+    from irlcli.rl.worlds import action_space
 
     found = []
     for setting in settings:
         with closing(make(env, setting)) as world:
-            found.append((observation_size(world.observation_space), world.action_space))
+            observations = world.observation_space
+            assert isinstance(observations, Box)
+            found.append((observations, world.action_space))
             start = first_index(world)
-    sizes = sorted({size for size, _ in found})
+    sizes = sorted({len(space.low) for space, _ in found})
     if len(sizes) > 1:
         raise UsageError(
             f"observations of {env} have {sizes[0]} numbers in some settings and {sizes[-1]} in "
             "others",
             "import settings with a goal apart from the others",
         )
-    return sizes[0], action_space(found[0][1]), start
+    low = np.min([space.low for space, _ in found], axis=0)
+    high = np.max([space.high for space, _ in found], axis=0)
+    return np.stack([low, high]), action_space(found[0][1]), start
 
 
 def _read(inputs: Mapping[str, Path], p: Parameters, expected: Expected) -> Iterator[Steps]:
@@ -147,7 +175,9 @@ def _read(inputs: Mapping[str, Path], p: Parameters, expected: Expected) -> Iter
         yield from read(inputs["source"], expected)
         return
     for index, text in enumerate(p.settings):
-        for steps in read(inputs[f"source {text}"], replace(expected, settings=(text,))):
+        others = tuple(other for other in p.settings if other != text)
+        one = replace(expected, settings=(text,), others=others)
+        for steps in read(inputs[f"source {text}"], one):
             yield replace(steps, settings=steps.settings + index)
 
 

@@ -1,8 +1,10 @@
 """What a user may write to refer to an artefact: a path, a name, or an id prefix."""
 
+import fnmatch
 import os
 import re
 import shlex
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -196,6 +198,26 @@ def check_name(name: str) -> None:
             "use a letter, then up to 99 letters, digits, '.', '_' or '-'; hexadecimal digits alone "
             "would read as an id",
         )
+
+
+def remove_names(layout: Layout, patterns: Sequence[str]) -> list[str]:
+    """Remove the names that a pattern matches as in a shell; returns them, sorted.
+
+    The artefacts stay until gc removes them. A name whose file is damaged is removed too.
+
+    Raises:
+        NotFound: a pattern matches no name. Then none is removed.
+    """
+    there = _pointers(layout)
+    matched = {pattern: fnmatch.filter(there, pattern) for pattern in patterns}
+    for pattern, found in matched.items():
+        if not found:
+            raise NotFound(f"no name matches {pattern!r}", layout.listing)
+    removed = sorted({name for found in matched.values() for name in found})
+    for name in removed:
+        (layout.names / name).unlink(missing_ok=True)
+    fsync_directory(layout.names)
+    return removed
 
 
 def set_name(layout: Layout, name: str, artefact: Artefact) -> str | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import shlex
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -148,6 +148,20 @@ class Store:
     def check_name(self, name: str) -> None:
         """Refuse an invalid name: see :func:`irlcli.store.references.check_name`."""
         references.check_name(name)
+
+    def remove_names(self, patterns: Sequence[str]) -> list[str]:
+        """Remove names: see :func:`irlcli.store.references.remove_names`.
+
+        Raises:
+            NotFound: as that.
+            StageFailed: the store cannot be written.
+        """
+        try:
+            return references.remove_names(self._writable, patterns)
+        except OSError as error:
+            raise StageFailed(
+                f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
+            ) from None
 
     def set_name(self, name: str, artefact: Artefact) -> None:
         """Name an artefact, and warn if another one loses the name: gc may now delete that.

@@ -126,6 +126,27 @@ def test_import_of_an_export_is_the_same_dataset(irl, store_copy, exported):
     assert returns[0] == returns[1]
 
 
+def test_observations_outside_the_environments_bounds_are_counted(
+    irl, store_copy, exported, tmp_path
+):
+    """LunarLander's positions lie within 2.5: in other units they do not."""
+    table = pq.read_table(exported)
+    observations = np.stack(table["obs"].to_pylist()).astype(np.float32)
+    assert (np.abs(observations[:, 0]) < 2.5).all()
+    following = np.stack(table["next_obs"].to_pylist()).astype(np.float32)
+    observations[:7, 0] = following[:6, 0] = 250.0
+    for name, values in (("obs", observations), ("next_obs", following)):
+        at = table.schema.get_field_index(name)
+        other = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 8)
+        table = table.set_column(at, name, other)
+    pq.write_table(table, tmp_path / "other.parquet")
+    line = [*LANDER, "--store", store_copy.path]
+    assert "warning" not in irl("import", exported, *line).err
+    done = irl("import", tmp_path / "other.parquet", *line)
+    assert done.code == 0
+    assert f"7 of {len(table)} steps have observations outside the environment's bounds" in done.err
+
+
 @pytest.fixture
 def minari(tmp_path, monkeypatch):
     """Minari with an empty directory of datasets."""
@@ -253,8 +274,19 @@ def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, m
     imported(irl, store_copy, *reversed(parts), *LANDER)
     assert irl("export", "demos", "demos", "--to", "minari:me/all-v0", *store[:2]).code == 0
     assert_answered(irl("import", "minari:me/all-v0", *one, *store), 2, "says engine-power=1.25x")
-    # In a foreign source the word may mean anything.
+    # In a foreign source the word may mean anything but a setting of the import's other sources.
     other = table.drop_columns(["setting"])
+    swapped = []
+    for text in ("1x", "1.25x"):
+        swapped.append(tmp_path / f"short-{text}.parquet")
+        mine = other.filter(pa.array(names == f"engine-power={text}"))
+        column = pa.array([text] * len(mine))
+        pq.write_table(mine.append_column("setting", column), swapped[-1])
+    imported(irl, store_copy, *swapped, *LANDER)
+    said = "says 1.25x, but the command names engine-power=1x"
+    assert_answered(irl("import", *reversed(swapped), *LANDER, *store), 2, said)
+    twice = [swapped[0], swapped[0]]
+    assert_answered(irl("import", *twice, *LANDER, *store), 2, "two of the sources are the same")
     foreign = pa.array(["1.25x" if i % 2 else "expert" for i in range(len(other))])
     pq.write_table(other.append_column("setting", foreign), tmp_path / "foreign.parquet")
     imported(irl, store_copy, tmp_path / "foreign.parquet", *one)
@@ -282,7 +314,11 @@ def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):
         ([exported, *robot, "--setting-column", "nothing"], 2, "no column 'nothing'"),
         ([exported, *lone, "--setting-column", "nothing"], 2, "no column 'nothing'"),
         ([exported, *lone, "--setting-column", "setting"], 2, "'engine-power=1.25x' is not one of"),
-        ([exported, exported, *LANDER, "--setting-column", "s"], 2, "is of one setting"),
+        (
+            [exported, tmp_path / "nan.parquet", *LANDER, "--setting-column", "s"],
+            2,
+            "is of one setting",
+        ),
         ([tmp_path / "nan.parquet", *LANDER], 2, f"row {len(table) - 1}: reward is not finite"),
         ([tmp_path / "text.parquet", *LANDER], 2, "text.parquet is not a Parquet file"),
         ([tmp_path, *LANDER], 2, "holds no trajectories of imitation"),

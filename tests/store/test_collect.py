@@ -157,6 +157,23 @@ def test_what_a_damaged_name_protects_is_not_deleted(irl, empty_store, family):
     assert irl("verify", "--store", empty_store.root).code == 0
 
 
+def test_names_that_are_removed_protect_nothing(irl, empty_store, family):
+    store = ("--store", empty_store.root)
+    for name in ("trial.one", "trial.two", "standard.one"):
+        empty_store.set_name(name, family["lonely" if name == "trial.two" else "demos"])
+    (empty_store.root / ".names" / "trial.three").write_text("garbage")
+    before = set(empty_store.ids())
+    refused = irl("unname", "trial.*", "nothing", *store)
+    assert refused.code == 3 and "'nothing'" in refused.err and "hint:" in refused.err
+    assert set(empty_store.names()) == {"trial.one", "trial.two", "standard.one"}
+    done = irl("unname", "trial.*", "trial.two", *store)
+    assert (done.code, done.out.split()) == (0, ["trial.one", "trial.three", "trial.two"])
+    assert set(empty_store.ids()) == before
+    assert irl("gc", "--delete", "--grace-days", "0", *store).code == 0
+    assert set(empty_store.ids()) == ids(family["demos"], family["expert"])
+    assert irl("unname", "x", "--store", empty_store.root / "nowhere").code == 3
+
+
 def test_a_collection_that_ended_is_not_named_as_the_user_of_the_store(empty_store, family):
     empty_store.collect(400 * DAY)
     with empty_store.in_use(), pytest.raises(Busy) as caught:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ import pyarrow.compute as pc
 
 from irlcli.data.steps import Irregular
 from irlcli.errors import UsageError, first_line
-from irlcli.interventions import parse_setting, same
+from irlcli.interventions import Setting, parse_setting, same
 from irlcli.trajectories import ActionSpace
 
 # From a row to where it stands in its source, for messages.
@@ -34,6 +35,7 @@ class Expected:
         horizon: time limit of the environment [steps].
         actions: the environment's actions.
         irregular: what to do with episodes that are not whole.
+        others: the settings of the import's other sources.
     """
 
     env: str
@@ -42,6 +44,7 @@ class Expected:
     horizon: int
     actions: ActionSpace
     irregular: Irregular
+    others: tuple[str, ...] = ()
 
     def index(self, name: Any, place: str) -> int:
         """The index of the setting called ``name``: ``mass=2x``, or ``2x`` of the only knob.
@@ -52,39 +55,48 @@ class Expected:
         text = str(name)
         if text in self.settings:
             return self.settings.index(text)
-        knobs = {knob for s in self.settings for knob in parse_setting(self.env, s).knobs}
-        of_the_only = [f"{knob}={text}" for knob in knobs] if len(knobs) == 1 else []
-        for written in (text, *of_the_only):
-            try:
-                found = parse_setting(self.env, written)
-            except UsageError:
-                continue
+        for found in self._meant(text):
             for index, own in enumerate(self.settings):
                 if same(parse_setting(self.env, own), found):
                     return index
         raise UsageError(
             f"{place}: setting {text[:80]!r} is not one of {', '.join(self.settings)}",
-            "correct the source, or name every setting of it by --intervention or --setting",
+            "correct the source (a multiplier is written as 2x), or name every setting of it by "
+            "--intervention or --setting",
         )
+
+    def _meant(self, text: str) -> Iterator[Setting]:
+        """What ``text`` may name: a setting, or a value of the only knob of all settings."""
+        listed = (*self.settings, *self.others)
+        knobs = {knob for s in listed for knob in parse_setting(self.env, s).knobs}
+        of_the_only = [f"{knob}={text}" for knob in knobs] if len(knobs) == 1 else []
+        for written in (text, *of_the_only):
+            with suppress(UsageError):
+                yield parse_setting(self.env, written)
 
     def contradicts(self, name: Any, place: str) -> None:
         """Refuse a source whose ``setting`` column names another setting than the only one expected.
 
-        Only the whole text of a setting counts: ``setting`` may mean anything in a foreign source.
+        ``setting`` may mean anything in a foreign source. So only the whole text of a setting counts,
+        or the value of one that another source of the import is of.
 
         Raises:
             UsageError: ``name`` is another setting of the environment.
         """
         (only,) = self.settings
-        try:
-            found = parse_setting(self.env, str(name))
-        except UsageError:
-            return
-        if not same(found, parse_setting(self.env, only)):
+        wrong = self._meant_by_others(str(name))
+        with suppress(UsageError):
+            wrong = parse_setting(self.env, str(name))
+        if wrong is not None and not same(wrong, parse_setting(self.env, only)):
             raise UsageError(
-                f"{place}: {SETTING!r} says {found}, but the command names {only}",
+                f"{place}: {SETTING!r} says {name}, but the command names {only}",
                 "name the settings that the source holds, or rename that column",
             )
+
+    def _meant_by_others(self, text: str) -> Setting | None:
+        others = [parse_setting(self.env, other) for other in self.others]
+        found = (s for s in self._meant(text) if any(same(s, other) for other in others))
+        return next(found, None)
 
     def shaped(self, actions: np.ndarray) -> np.ndarray:
         """``actions`` [B], [B, K] or [B, A] in the form that the environment's actions have."""
