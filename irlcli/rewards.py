@@ -59,7 +59,8 @@ class LearnedReward:
         Args:
             obs, next_obs: [B, D]. After a step that ends an episode, ``next_obs`` is that episode's
                 last observation, not the first one of the next.
-            act: [B, A] vectors, or [B] or [B, K] indices.
+            act: [B, A] vectors, or [B] or [B, K] indices, counted from 0 also where the environment's
+                actions begin at another number.
             done: [B] bool, whether the step terminated the episode. A time limit does not
                 terminate: pass False for it.
 

@@ -237,7 +237,9 @@ def run_jobs(
     try:
         count = submission.submit()
         if count:
-            session.console.say(f"{out.counted(count, 'job')} submitted")
+            # A queue of this machine starts a job when it may run, and until then it has none.
+            what = "submitted" if queue.starts_what_waits else "to run on this machine"
+            session.console.say(f"{out.counted(count, 'job')} {what}")
         if options.detach:
             if session.as_json:
                 out.print_json("submission", {"table": plan.table.name, "submitted": count})

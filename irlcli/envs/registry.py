@@ -42,7 +42,12 @@ def environment(name: str) -> EnvironmentSpec:
     if spec is not None:
         return introduce(spec)
     hint = suggest(name, [*ENVIRONMENTS, *_KNOWN, *announced()])
-    raise UsageError(f"unknown environment {name!r}", f"{hint}; or give a TOML file")
+    file = (
+        "a TOML file is read by `resolve` first"
+        if name.endswith(".toml")
+        else "or give a TOML file"
+    )
+    raise UsageError(f"unknown environment {name!r}", f"{hint}; {file}")
 
 
 def resolve(ref: str) -> EnvironmentSpec:
