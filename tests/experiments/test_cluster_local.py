@@ -39,7 +39,7 @@ def test_it_ends_in_the_ids_of_a_run_without_a_cluster(irl, plain, runs, tmp_pat
     store = tmp_path / "runs"
     errors = runs.run(store, "--cluster", "local", "--jobs", "4", *REWARDS)
     assert Store(store).ids() == whole and sorted(runs.processes()) == processes
-    assert "6 jobs submitted" in errors and f"RUN {ROW}.irm.0" in errors
+    assert "6 jobs to run" in errors and f"RUN {ROW}.irm.0" in errors
     runs.log.write_text("")
     errors = runs.run(store, "--cluster", "local", *REWARDS)
     assert "submitted" not in errors and runs.processes() == []

@@ -283,7 +283,7 @@ def test_artefacts_of_two_environments_of_one_name_are_not_combined(bench):
         demos = made(bench, "collect-experts", *own)
         learned.append(made(bench, "train-airl", "--demos", demos, "--method", "erm", *SMOKE))
     mixed = bench.irl("evaluate", "--policy", learned[0], "--reward", learned[1], *SMOKE)
-    assert mixed.code == 2 and "another 'cart'" in mixed.err and learned[1] in mixed.err
+    assert mixed.code == 2 and "another version of 'cart'" in mixed.err and learned[1] in mixed.err
     alone = bench.irl("evaluate", "--policy", learned[0], "--reward", learned[0], *SMOKE)
     assert alone.code == 0, alone.err
 
