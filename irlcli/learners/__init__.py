@@ -1,4 +1,10 @@
-"""Learners turn demonstrations into a reward. Importing this loads no torch."""
+"""Learners turn demonstrations into a reward. Importing this loads no torch.
+
+The reward, from training to other programs: :mod:`~irlcli.learners.reward_model` is g and h,
+:mod:`~irlcli.learners.scoring` how they score a policy in training, :mod:`~irlcli.learners.frozen`
+what is left when training ended, :mod:`~irlcli.learners.standalone` the module inside it that
+leaves the package, and :mod:`irlcli.rewards` the function of arrays around it.
+"""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
