@@ -205,7 +205,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     settings: Annotated[tuple[Returns, ...], Meta(min_length=1)]
 
 
-Verdict = Literal["retrained", "wrong reward", "optimisation fell short"]
+Verdict = Literal["matches the expert", "wrong reward", "optimisation fell short"]
 
 
 class Measured(Struct, frozen=True, kw_only=True):
@@ -241,7 +241,7 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
             demonstrations; None without.
         verdict: None where the expert earns no more than the random agent.
         clear: whether the differences that decide the verdict exceed two standard errors: of the
-            regret to the allowed one and, unless retrained, of the learned returns.
+            regret to the allowed one and, unless it matches the expert, of the learned returns.
         from_student: whether the policy began as the reward's student.
     """
 

@@ -141,7 +141,7 @@ def criteria(cells: pd.DataFrame, verdicts: bool) -> list[str]:
         return []
     return [
         "Two criteria: shares of the expert and the gates divide by the expert's whole return; the "
-        "verdicts (retrained, short) by what it earns above the random agent. One policy can pass one "
+        "verdicts (matches the expert, short) by what it earns above the random agent. One policy can pass one "
         "and fail the other."
     ]
 

@@ -300,10 +300,10 @@ def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             scores = both[["learned_return", "learned_return_expert"]]
             means = map(float, scores.groupby(both["seed"]).mean().mean())
             counts = (
-                len(verdicts) - verdicts.count("retrained"),
+                len(verdicts) - verdicts.count("matches the expert"),
                 verdicts.count("wrong reward"),
                 sum(not judgement.clear for judgement in judged),
-                sum(not j.clear for j in judged if j.verdict != "retrained"),
+                sum(not j.clear for j in judged if j.verdict != "matches the expert"),
             )
             seeds = both["seed"].nunique()
             found.append((row.name, method, seeds, len(verdicts), *means, *counts))

@@ -66,7 +66,7 @@ _QUALITY_NOTE = (
     "at several noise levels, student, experts, retrained policy): Spearman's correlation of learned "
     "with true return, over the bank and over the half with the lower true returns, median over seeds "
     "(least to largest). Expert - idle: learned reward per step, in standard deviations of g, median "
-    "over seeds. The next three count the policies retrained from scratch by verdict: retrained, if the "
+    "over seeds. The next three count the policies retrained from scratch by verdict: matches the expert, if the "
     "regret is within 10 % of what the expert earns above the random agent; else wrong reward, if the "
     "policy's learned return is at least the expert's; else optimisation fell short. Uncertain: verdicts on "
     "differences within two standard errors."

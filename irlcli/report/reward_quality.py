@@ -191,7 +191,7 @@ def return_distance(members: Sequence[Member]) -> float | None:
 def judge(regret: Measured, margin: float, gap: Measured) -> Judgement:
     """Why a retrained policy does not earn what the expert earns, if it does not.
 
-    None where the expert earns no more than the random agent. ``retrained``: its regret is within
+    None where the expert earns no more than the random agent. ``matches the expert``: its regret is within
     10 % of what the expert earns above the random agent. ``wrong reward``: its learned return is at
     least the expert's. ``optimisation fell short``: the expert's learned return is higher, so the
     reward still offers more.
@@ -205,7 +205,7 @@ def judge(regret: Measured, margin: float, gap: Measured) -> Judgement:
         return Judgement(None, False)
     beyond = regret.mean - ALLOWED_REGRET * margin
     if beyond <= 0.0:
-        return Judgement("retrained", _is_clear(beyond, regret))
+        return Judgement("matches the expert", _is_clear(beyond, regret))
     verdict: Verdict = "wrong reward" if gap.mean <= 0.0 else "optimisation fell short"
     return Judgement(verdict, _is_clear(beyond, regret) and _is_clear(gap.mean, gap))
 

@@ -233,7 +233,7 @@ def test_an_assessment_without_the_agents_that_its_verdicts_need():
     document = {
         "env": "ant",
         "reward": {"method": "erm", "seed": 0, "settings": ["mass=1x"]},
-        "settings": [place | {"retrained": [verdict | {"verdict": "retrained"}]}],
+        "settings": [place | {"retrained": [verdict | {"verdict": "matches the expert"}]}],
         "pooled": None,
         "bank": [],
     }

@@ -140,7 +140,7 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
     assert verdicts["the other"] == "optimisation fell short"
     p, points = example(complete())
     report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): assessment})
-    assert report.reward_quality["verdicts"].tolist() == [["retrained"]]
+    assert report.reward_quality["verdicts"].tolist() == [["matches the expert"]]
     assert report.reward_quality["uncertain"].tolist() == [0]
     # Regrets of 16 and 20, of which 20 are allowed: 2 less in the mean, one standard error.
     members[3] = member("begun as a student", "retrained", 82.0, spread=-1.0)
