@@ -121,7 +121,7 @@ def test_what_cannot_be_drawn_is_named(irl, smoke_store, tmp_path):
         (["airl", "--out", tmp_path / "no" / "a.mp4"], 2, "not a directory"),
         (["airl", "--out", smoke_store.path / "a.gif"], 2, "lies in the store"),
         (["airl", "--out", tmp_path / "a.mp4", "--reward", "nothing"], 3, "nothing"),
-        (["airl", "--out", tmp_path / "a.mp4", "--reward", "demos"], 3, "reward.pt"),
+        (["airl", "--out", tmp_path / "a.mp4", "--reward", "demos"], 2, "reward.pt"),
     ):
         assert_answered(irl("play", *words, *common), code, named)
 
