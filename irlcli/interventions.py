@@ -390,4 +390,8 @@ def without_cue(env: str, setting: Setting) -> Setting:
 
 def env_kwargs(env: str, setting: Setting) -> dict[str, Any]:
     """The keyword arguments that make ``env`` an instance of ``setting``."""
-    return {knob_of(env, knob).argument: value.argument for knob, value in setting.changes}
+    found = {}
+    for knob, value in setting.changes:
+        spec = knob_of(env, knob)
+        found[spec.argument] = int(value.numbers[0]) if spec.whole else value.argument
+    return found

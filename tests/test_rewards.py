@@ -181,6 +181,15 @@ def test_what_it_cannot_use_is_named(smoke_store, tmp_path):
             irlcli.load_reward(**words)
 
 
+def test_a_policy_is_scored_by_rewards_of_its_environment_only(irl, smoke_store, tmp_path):
+    path, _ = write_random_reward(tmp_path, "half-cheetah")
+    common = ["--reward", path, "--store", smoke_store.path]
+    for line in (["evaluate", "--policy", "airl"], ["play", "airl", "--out", tmp_path / "x.gif"]):
+        done = irl(*line, *common)
+        assert done.code == 2 and "'airl' is a policy of lunar-lander" in done.err
+        assert "half-cheetah" in done.err and "--env" not in done.err
+
+
 def test_importing_the_package_stays_light():
     code = (
         "import sys, irlcli; irlcli.__version__; dir(irlcli); "

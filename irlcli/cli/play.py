@@ -63,7 +63,7 @@ def play(
     session.check_file(file, "--out")
     scored_by = _scored_by(session, source, reward)
     if scored_by is not None:
-        arguments.check_env(reward or "its reward", scored_by[1].env, env)
+        arguments.check_scorer(scored_by[1].env, policy, env)
         check_observed(env, scored_by[1].settings, settings)
 
     from irlcli.data.tensors import load_policy_file

@@ -127,7 +127,8 @@ class Adapted(gymnasium.Wrapper):
         progress, error = info.get("progress", 0.0), info.get("error")
         if not (isinstance(progress, Real) and math.isfinite(progress)):
             raise self._wrong("step", 'returned an info["progress"] that is not a finite number')
-        text = None if error is None or error is False else str(error)
+        none = error is None or (np.size(error) <= 1 and not error)
+        text = None if none else str(error) or "unknown error"
         found = info | {"error": text}
         return found | {"progress": float(progress)} if "progress" in info else found
 

@@ -136,12 +136,36 @@ def _sources(root: Path, module: str, where: str) -> list[Path]:
             continue
         seen.add(name)
         files = _files(root, name)
+        if name != module and files and not _is_taken(root, name, files, where):
+            continue
         other = _distribution(name, root) if files else None
         if other is None or (own and other.name == own.name):
             found += files
             written = [path for path in files if path.suffix == ".py"]
             pending += [imported for path in written for imported in _imported(path, where)]
     return found
+
+
+def _is_taken(root: Path, name: str, files: Sequence[Path], where: str) -> bool:
+    """Whether Python imports ``name`` from its ``files`` in ``root``; its own library precedes them.
+
+    Raises:
+        UsageError: it imports another module of that name.
+    """
+    if name in sys.stdlib_module_names:
+        return False
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        spec = None
+    places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    taken = [Path(place).resolve() for place in places if place is not None]
+    if not {(root / name).resolve(), *(file.resolve() for file in files)}.isdisjoint(taken):
+        return True
+    raise UsageError(
+        f"{where}: two modules are called {name!r}: {root / name} and {', '.join(map(str, taken)) or 'another'}",
+        f"rename the one in {root}",
+    )
 
 
 def _files(root: Path, name: str) -> list[Path]:

@@ -25,7 +25,7 @@ from irlcli.errors import IrlError, StageFailed, UsageError, described, first_li
 from irlcli.interventions import Setting, cue_in, env_kwargs, without_cue
 
 # What this process imported, as it was then: Python imports a module once.
-_imported: dict[str, Code] = {}
+_imported: dict[tuple[str, tuple[str, ...]], Code] = {}
 
 
 def register() -> None:
@@ -162,6 +162,11 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
             f"{own.source}: env.id: {first_line(error)[:300]}", "is the id registered?"
         ) from error
     except (Exception, SystemExit) as error:
+        if "render_mode" in arguments and "render_mode" in str(error):
+            raise UsageError(
+                f"{where} draws no pictures: its constructor refuses render_mode='rgb_array'",
+                'irl play needs an environment whose metadata lists the render mode "rgb_array"',
+            ) from error
         named = dict.fromkeys(keywords, "env.arguments")
         named |= {k.argument: f"knobs.{name}.argument" for name, k in spec.knobs.items()}
         given = ", ".join(f"{name}={value!r} ({named[name]})" for name, value in keywords.items())
@@ -177,11 +182,16 @@ def _import(spec: EnvironmentSpec, own: Own) -> None:
     A description from an artefact of others must not make code run that it does not know.
     """
     module = module_of(own.id, spec.entry_point)
-    if module not in _imported:
+    # Two environments may share a module and read different files.
+    alone, with_files = (module, ()), (module, own.files)
+    if with_files not in _imported:
         check_code(spec)
         import_module(module)
-        _imported[module] = code_of(module, own.files, own.directory, own.source)
-    if _imported[module] != own.code:
+        _imported[with_files] = code_of(module, own.files, own.directory, own.source)
+        now = code_of(module, (), own.directory, own.source)
+        if _imported.setdefault(alone, now) != now:
+            del _imported[with_files]
+    if _imported.get(with_files) != own.code:
         raise StageFailed(
             f"{own.source}: {module} changed since this process imported it",
             "run the same command again; in a notebook, restart Python",

@@ -240,17 +240,26 @@ class WorkerWorlds:
             for worker, connection in enumerate(self._connections):
                 answer = connection.recv()
                 if isinstance(answer, _Failure):
-                    message = f"{self._name(worker)}: {answer.message}"
-                    raise WorkerFailed(message, answer.hint) from _InWorker(answer.traceback)
+                    raise self._failed(worker, answer)
                 ended += answer
         except BaseException as error:
             # An unread answer would be mistaken for the answer to the next request.
-            failure = self._died(worker) if isinstance(error, _CLOSED) else error
+            failure = self._why_closed(worker) if isinstance(error, _CLOSED) else error
             self.close()
-            raise failure from error.__cause__
+            raise failure from failure.__cause__
         return sorted(ended, key=lambda end: end.world)
 
-    def _died(self, worker: int) -> WorkerFailed:
+    def _failed(self, worker: int, failure: _Failure) -> WorkerFailed:
+        found = WorkerFailed(f"{self._name(worker)}: {failure.message}", failure.hint)
+        found.__cause__ = _InWorker(failure.traceback)
+        return found
+
+    def _why_closed(self, worker: int) -> WorkerFailed:
+        # A worker that failed before it was asked has left its reason.
+        with suppress(*_CLOSED):
+            answer = self._connections[worker].recv()
+            if isinstance(answer, _Failure):
+                return self._failed(worker, answer)
         process = self._processes[worker]
         process.join(_CLOSE_SECONDS)
         code = process.exitcode

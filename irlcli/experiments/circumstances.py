@@ -7,6 +7,8 @@ from typing import Any
 
 from irlcli.store import Artefact, Index
 
+_KNOBS = "environment.own.knobs."
+
 
 def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
     """The parameters behind an evaluation that all its seeds share, by ``STAGE.FIELD``.
@@ -27,7 +29,9 @@ def circumstances(artefact: Artefact, index: Index) -> dict[str, Any]:
         record = at.manifest.record
         for name, value in flat(record.parameters):
             chosen = name == "airl.penalty_weight" and "penalty choice" in record.inputs
-            unshared = name in ("settings", "setting") or (name == "seed" and at is not artefact)
+            # The knobs of one's own environment follow from the settings, too.
+            of_settings = name in ("settings", "setting") or name.startswith(_KNOBS)
+            unshared = of_settings or (name == "seed" and at is not artefact)
             if not unshared and not chosen:
                 found[f"{prefix}{record.stage}.{name}"] = value
         for role in ("policy", "reward", "demonstrations"):

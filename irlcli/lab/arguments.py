@@ -48,6 +48,7 @@ _FORMS: dict[str, tuple[str, tuple[type, ...]]] = {
     "None": ("None", (type(None),)),
     "Sequence": ("a list", (Sequence,)),
     "Mapping": ("a dict", (Mapping,)),
+    "Ref": ("an artefact, or its name, id or path", (str, os.PathLike)),
     "Overrides": ("a dict or a list", (Sequence, Mapping)),
 }
 
@@ -136,9 +137,7 @@ def overrides(given: Overrides) -> list[str]:
     """As for ``--set``: each ``FIELD=VALUE``."""
     if isinstance(given, Mapping):
         return [f"{field}={_toml(value)}" for field, value in given.items()]
-    for item in (items := listed(given)):
-        _check_form("set", item, ["str"])
-    return items
+    return texts("set", given)
 
 
 def merged(first: Sequence[str], later: Sequence[str]) -> list[str]:
@@ -160,6 +159,17 @@ def _toml(value: Any) -> str:
 def _element(value: Any) -> str:
     """``value`` in a list of TOML. A scalar of NumPy is the number that it holds."""
     return json.dumps(value.item() if hasattr(value, "item") else value)
+
+
+def texts(name: str, given: Any) -> list[str]:
+    """One text, or several, as a list.
+
+    Raises:
+        UsageError: something else than text.
+    """
+    for item in (items := listed(given)):
+        _check_form(name, item, ["str"])
+    return items
 
 
 def listed(given: Any) -> list[Any]:

@@ -19,6 +19,7 @@ from irlcli.lab.arguments import (
     overrides,
     plainly,
     text_of,
+    texts,
     whole,
     words,
 )
@@ -421,7 +422,7 @@ class Lab:
             elif name in ("env", "intervention", "ood", "trained_in", "choose_penalty"):
                 value = joined(value)
             elif name == "setting":
-                value = listed(value)
+                value = texts("setting", value)
             elif name in ("penalty_weight", "l2"):
                 value = number(name, value)
             elif name == "seed":

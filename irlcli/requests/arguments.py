@@ -207,6 +207,19 @@ def row(text: str) -> str:
     return text if file is None else resolve(file[1]).name + (file[2] or "")
 
 
+def check_scorer(learned: str, policy: str, env: str) -> None:
+    """Refuse to score ``policy``, which acts in ``env``, by a reward ``learned`` in another environment.
+
+    Raises:
+        UsageError: names both environments.
+    """
+    if learned != env:
+        raise UsageError(
+            f"{policy!r} is a policy of {env}, but the reward is one of {learned}",
+            "name a reward of the policy's environment",
+        )
+
+
 def check_env(ref: str, learned: str, wanted: str | None) -> None:
     """Refuse ``--env`` if it is not the environment that ``ref`` belongs to.
 

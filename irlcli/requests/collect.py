@@ -3,13 +3,14 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from irlcli.configs import Config
 from irlcli.configs.load import field_of
 from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.envs.registry import resolve
 from irlcli.errors import UsageError
 from irlcli.experiments.recordings import recorded
 from irlcli.experiments.references import output
-from irlcli.interventions import parse_setting, without_cue
+from irlcli.interventions import Setting, listed_settings, parse_setting, without_cue
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession, check_path
 from irlcli.stages import collect_experts as collect_stage
@@ -46,7 +47,6 @@ def collect_experts(
         raise UsageError("--trust needs --expert, whose files it is about", "omit --trust")
     config = session.config(env)
     settings = arguments.where(None, intervention, setting).settings(env, config)
-    listed = config.interventions.get(intervention or "")
     counts: Sequence[int] = ()
     if episodes is not None:
         counts = arguments.counts(episodes)
@@ -54,10 +54,26 @@ def collect_experts(
             raise UsageError(
                 "--episodes and --set demonstrations.episodes are both given", "omit one of them"
             )
-    elif listed is not None and not setting:
-        counts = listed.episodes
+    else:
+        counts = _listed_counts(env, config, settings)
     experts, normalisers = arguments.experts(session.store, env, expert)
     return collect_stage.request(env, settings, config, seed, counts, experts, trust, normalisers)
+
+
+def _listed_counts(env: str, config: Config, settings: Sequence[Setting]) -> Sequence[int]:
+    """The own ``episodes`` of the only knob of all ``settings``; none if it does not have each one's."""
+    knobs = {knob for setting in settings for knob in setting.knobs}
+    if len(knobs) != 1:
+        return ()
+    (knob,) = knobs
+    listed = config.interventions.get(knob)
+    if listed is None:
+        return ()
+    if len(listed.episodes) == 1:
+        return listed.episodes
+    counts = dict(zip(listed_settings(env, knob, listed.id), listed.episodes, strict=False))
+    found = [counts[setting] for setting in settings if setting in counts]
+    return found if len(found) == len(settings) else ()
 
 
 def summary(session: StageSession, artefact: Artefact) -> DemonstrationSummary:

@@ -90,6 +90,8 @@ def _of_policy(
     scored: Mapping[str, Any],
 ) -> Request:
     source, origin = references.tensor_file(session.store, policy, "policy")
+    if scorer is not None:
+        arguments.check_scorer(scorer.env, policy, origin.env)
     arguments.check_env(policy, origin.env, env)
     config = session.config(origin.env, {"evaluation.episodes": episodes})
     settings: Sequence[Setting]

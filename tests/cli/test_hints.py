@@ -10,6 +10,7 @@ import typer
 from irlcli.cli.app import app
 from irlcli.cli.session import StageSession
 from irlcli.errors import UsageError
+from irlcli.requests.collect import collect_experts
 from irlcli.store import Store
 
 SMOKE = ["--profile", "smoke"]
@@ -180,6 +181,25 @@ def session(store, profile="standard", overrides=(), sources=(), workers=1, tens
         quiet=True,
         tensorboard=tensorboard,
     )
+
+
+@pytest.mark.parametrize(
+    ("intervention", "counts"),
+    [
+        ("goal-y", [2, 1]),
+        ("goal-y=-900,0", [2, 1]),
+        ("goal-y=0,-900", [1, 2]),
+        ("goal-y=-900", [2]),
+        # The listed settings' counts say nothing about others.
+        ("goal-y=-800,0", [1, 1]),
+    ],
+)
+def test_a_knobs_own_counts_are_used_however_its_values_are_named(tmp_path, intervention, counts):
+    wanted = {"env": "ant", "intervention": intervention, "setting": [], "seed": 0}
+    request = collect_experts(
+        session(tmp_path, "smoke"), **wanted, expert=[], trust=False, episodes=None
+    )
+    assert list(request.parameters.episodes) == counts
 
 
 def test_a_suggested_command_repeats_what_is_no_default(tmp_path, monkeypatch):

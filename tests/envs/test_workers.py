@@ -188,6 +188,20 @@ def test_the_hint_of_an_environments_error_is_kept():
     assert failed.value.hint == "give it a floor"
 
 
+def refused():
+    raise ValueError("m must be at most 1.5")
+
+
+def test_a_world_that_cannot_be_made_is_named_however_late_it_is_asked():
+    before = {process.pid for process in multiprocessing.active_children()}
+    worlds = WorkerWorlds([Fragile, refused], max_episode_steps=100, workers=2)
+    made = [p for p in multiprocessing.active_children() if p.pid not in before]
+    # Its workers are started in order, and the second one ends at once.
+    assert wait_for_death([max(process.pid for process in made)])
+    with pytest.raises(WorkerFailed, match=r"worker 1 \(world 1\): ValueError: m must be at most"):
+        worlds.reset([0, 0])
+
+
 class Late(Fragile):
     """Fails after the parent has ended its workers."""
 

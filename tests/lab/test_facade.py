@@ -263,6 +263,10 @@ def test_a_plan_says_what_irl_plan_says(lab, irl):
             UsageError,
             "transfer.total_steps is given twice",
         ),
+        (lambda lab: lab.train_airl(None), UsageError, "demos None is not an artefact"),
+        (lambda lab: lab.transfer(None, ood="2x"), UsageError, "reward None is not an artefact"),
+        (lambda lab: lab.assess(3), UsageError, "reward 3 is not an artefact"),
+        (lambda lab: lab.evaluate("airl", setting=[None]), UsageError, "setting None is not text"),
         (lambda lab: irlcli.Lab("/dev/null/runs").evaluate(idle=True, **IDLE), UsageError, "hint"),
     ],
 )

@@ -175,6 +175,21 @@ def test_two_modules_of_one_name_are_refused(lab):
         digest(lab, "json")
 
 
+def test_a_helper_that_python_imports_from_elsewhere_is_refused(lab, monkeypatch):
+    """The key would hold the one beside the module, and the other one would run."""
+    (lab / "other").mkdir()
+    (lab / "other" / "lab_physics.py").write_text("")
+    before = digest(lab)
+    monkeypatch.syspath_prepend(lab / "other")
+    with pytest.raises(UsageError, match="two modules are called 'lab_physics'"):
+        digest(lab)
+    (lab / "other" / "lab_physics.py").unlink()
+    assert digest(lab) == before
+    # Python's own library precedes every file.
+    (lab / "json.py").write_text("")
+    assert digest(lab) == before
+
+
 # The code of installed modules
 
 

@@ -19,7 +19,7 @@ from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs import registration, registry
 from irlcli.envs.registration import make
 from irlcli.envs.registry import resolve
-from irlcli.errors import NotFound
+from irlcli.errors import NotFound, StageFailed
 from irlcli.interventions import Setting
 from irlcli.rl.rollout import roll_out
 from irlcli.store import Store
@@ -273,6 +273,59 @@ def test_a_lab_takes_the_environment_from_each_artefact(bench):
     lab.evaluate(idle=True, env="cart.toml", intervention="mass=2x").to_pandas()
     lab.evaluate(policy=reward).to_pandas()
     second.to_pandas()
+
+
+def test_two_environments_may_share_a_module_and_read_different_files(bench):
+    for name in ("a", "b"):
+        (bench.directory / f"{name}.xml").write_text(name)
+        text = bench.toml.read_text().replace(
+            "[env]", f'[env]\nname = "{name}"\nfiles = ["{name}.xml"]'
+        )
+        (bench.directory / f"{name}.toml").write_text(text)
+    lab = irlcli.Lab("runs", profile="smoke", quiet=True)
+    made = [
+        lab.evaluate(idle=True, env=f"{name}.toml", intervention="mass=2x")[0]
+        for name in ("a", "b", "a")
+    ]
+    assert made[0].id == made[2].id != made[1].id
+    bench.edit(bench.module, "1.0 - abs", "2.0 - abs")
+    with pytest.raises(StageFailed, match="changed since this process imported it"):
+        lab.evaluate(idle=True, env="b.toml", intervention="mass=2x", seed=1)
+
+
+def test_a_whole_number_reaches_the_constructor_as_an_int(bench):
+    bench.edit(bench.toml, 'argument = "drag"', 'argument = "drag"\nwhole = true')
+    bench.edit(bench.toml, 'id = ["0.1", "0.5"]', 'id = ["0", "2"]')
+    bench.edit(bench.module, "self.drag = drag", "self.drag = len(range(drag))")
+    bench.edit(bench.module, "drag=0.1", "drag=1")
+    one = ("--env", "cart.toml", "--intervention", "drag=2", "--profile", "smoke")
+    done = bench.irl("evaluate", "--idle", *one)
+    assert done.code == 0, done.err
+
+
+def test_seeds_share_a_row_however_many_settings_each_was_evaluated_in(bench):
+    common = ("--profile", "smoke", "--quiet")
+    both = ("--env", "cart.toml", "--intervention", "mass=1x,2x")
+    assert bench.irl("collect-experts", *both, "--name", "demos", *common).code == 0
+    more = {0: (), 1: ("--setting", "drag=0.5")}
+    for seed, settings in more.items():
+        learn = ("train-airl", "--demos", "demos", "--seed", seed, "--name", f"erm-{seed}")
+        assert bench.irl(*learn, *common).code == 0
+        measure = ("evaluate", "--policy", f"erm-{seed}", "--setting", "mass=4x", *settings)
+        assert bench.irl(*measure, "--name", f"score-{seed}", *common).code == 0
+    rows = json.loads(bench.irl("report", "returns", "score-0", "score-1", "--json").out)["rows"]
+    seeds = {row["setting"]: len(row["returns"]) for row in rows}
+    assert len(rows) == 2 and seeds == {"mass=4x": 2, "drag=0.5": 1}
+
+
+def test_an_environment_without_pictures_is_named_by_irl_play(bench):
+    bench.edit(bench.module, ", render_mode=None", "")
+    bench.edit(bench.module, "        self.render_mode = render_mode\n", "")
+    both = ("--env", "cart.toml", "--intervention", "mass=1x,2x", "--profile", "smoke", "--quiet")
+    assert bench.irl("collect-experts", *both, "--name", "demos").code == 0
+    expert = json.loads(bench.irl("lineage", "demos", "--json").out)["inputs"][0]["from"]["id"]
+    done = bench.irl("play", expert, "--out", "x.gif")
+    assert done.code == 2 and "draws no pictures" in done.err and "env.arguments" not in done.err
 
 
 def test_artefacts_of_two_environments_of_one_name_are_not_combined(bench):

@@ -235,6 +235,17 @@ def test_a_progress_is_a_number_and_an_error_is_text():
     assert truncated
 
 
+@pytest.mark.parametrize("none", [None, False, 0, "", np.False_, [], {}])
+def test_an_error_that_says_nothing_is_none(none):
+    class Quiet(Counter):
+        info: ClassVar = {"error": none}
+
+    world = Adapted(Quiet(), "quiet")
+    world.reset(seed=0)
+    *_, truncated, info = world.step(np.zeros(1))
+    assert info == {"error": None} and not truncated
+
+
 def test_flat_observations_and_actions_of_any_shape(bench):
     bench.edit(bench.module, OBSERVATIONS, f"{SPACES}Box(-10, 10, (2, 1), np.float64)")
     bench.edit(bench.module, RETURNED, "return np.array([[self.position], [self.speed]])")

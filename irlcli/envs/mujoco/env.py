@@ -1,6 +1,7 @@
 """Five of Gymnasium's MuJoCo robots with interventions on their bodies and their world.
 
-Where nothing is changed, states and rewards equal those of Gymnasium's v5 environments bit for bit.
+Where nothing is changed, states and rewards equal those of Gymnasium's v5 environments bit for bit, for
+actions of double precision.
 """
 
 from __future__ import annotations
