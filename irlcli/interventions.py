@@ -393,5 +393,7 @@ def env_kwargs(env: str, setting: Setting) -> dict[str, Any]:
     found = {}
     for knob, value in setting.changes:
         spec = knob_of(env, knob)
-        found[spec.argument] = int(value.numbers[0]) if spec.whole else value.argument
+        if spec.whole:
+            value = Value(value.form, tuple(map(int, value.numbers)))
+        found[spec.argument] = value.argument
     return found

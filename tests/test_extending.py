@@ -121,6 +121,7 @@ def test_a_mistake_in_a_penalty_is_named(irl, lab, store_copy, monkeypatch, code
     (lab("risk_range.py").parent / "wrong.py").write_text(code)
     monkeypatch.setitem(penalties.PENALTIES, "wrong", penalties.Penalty("lab.wrong", ("airl",)))
     line = ["train-airl", "--demos", "demos", "--grouping", "per-setting", "--penalty", "wrong"]
+    line += ["--set", "airl.penalty_warmup_rounds=1"]
     done = irl(*line, "--store", store_copy.path, "--profile", "smoke", "--quiet")
     assert done.code == 1 and said in done.err, done.err
     assert done.err.count("error:") == 1 and "hint:" in done.err and "defect" not in done.err

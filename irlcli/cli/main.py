@@ -98,6 +98,7 @@ def _own_code(error: Exception) -> str:
     import os
     import sysconfig
     import traceback
+    from pathlib import Path
 
     import irlcli
 
@@ -111,6 +112,7 @@ def _own_code(error: Exception) -> str:
         for frame in traceback.extract_tb(error.__traceback__)
         if os.path.isfile(frame.filename)
         and not os.path.realpath(frame.filename).startswith(libraries)
+        and {"site-packages", "dist-packages"}.isdisjoint(Path(frame.filename).parts)
     ]
     return places[-1] if places else ""
 

@@ -147,23 +147,28 @@ def _sources(root: Path, module: str, where: str) -> list[Path]:
 
 
 def _is_taken(root: Path, name: str, files: Sequence[Path], where: str) -> bool:
-    """Whether Python imports ``name`` from its ``files`` in ``root``; its own library precedes them.
+    """Whether Python imports ``name`` from its ``files`` in ``root``.
+
+    It does not if its own library comes first on its path, or an installed package has the name of a
+    mere folder.
 
     Raises:
         UsageError: it imports another module of that name.
     """
-    if name in sys.stdlib_module_names:
-        return False
     try:
         spec = importlib.util.find_spec(name)
     except (ImportError, ValueError):
         spec = None
     places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
     taken = [Path(place).resolve() for place in places if place is not None]
-    if not {(root / name).resolve(), *(file.resolve() for file in files)}.isdisjoint(taken):
+    here = {(root / name).resolve(), *(file.resolve() for file in files)}
+    if not taken or not here.isdisjoint(taken):
         return True
+    is_folder = not any(file.parent == root or file.stem == "__init__" for file in files)
+    if is_folder or name in sys.stdlib_module_names:
+        return False
     raise UsageError(
-        f"{where}: two modules are called {name!r}: {root / name} and {', '.join(map(str, taken)) or 'another'}",
+        f"{where}: two modules are called {name!r}: {files[0]} and {taken[0]}",
         f"rename the one in {root}",
     )
 

@@ -32,7 +32,7 @@ _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
 _MAX_NUMBER = 1e300
 # Version of how such environments are stepped (irlcli.envs.adapted, irlcli.rl.rollout); part of
 # every key.
-_PHYSICS = 2
+_PHYSICS = 3
 _EXAMPLES = "docs/own-environments.md"
 # The column ``t`` of demonstrations is int32.
 _Steps = Annotated[int, Meta(ge=1, le=2**31 - 1)]

@@ -42,11 +42,9 @@ def environment(name: str) -> EnvironmentSpec:
     if spec is not None:
         return introduce(spec)
     hint = suggest(name, [*ENVIRONMENTS, *_KNOWN, *announced()])
-    file = (
-        "a TOML file is read by `resolve` first"
-        if name.endswith(".toml")
-        else "or give a TOML file"
-    )
+    file = "or give a TOML file"
+    if name.endswith(".toml"):
+        file = "in Python, irlcli.envs.registry.resolve(FILE).name is the name of the file's environment"
     raise UsageError(f"unknown environment {name!r}", f"{hint}; {file}")
 
 

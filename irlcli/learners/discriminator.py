@@ -111,21 +111,21 @@ def discriminator_loss(
     unbiased = config.penalty_estimate == "unbiased"
     options = PenaltyOptions(config.penalty_scaling, unbiased, penalty_weight)
     penalised = discriminator_penalty(config.penalty)(seen, options)
+    _check_penalty(config.penalty, penalised, logits.requires_grad and penalty_weight > 0.0)
     total = student_share * risk + others
     if penalty_weight > 0.0:
-        _check_penalty(config.penalty, penalised, logits.requires_grad)
         total = total + penalty_weight * penalised
         total = total / loss_divisor(config.penalty, penalty_weight)
     return Loss(total, risk.detach(), penalised.detach())
 
 
-def _check_penalty(name: str, found: object, differentiable: bool) -> None:
+def _check_penalty(name: str, found: object, weighed: bool) -> None:
     if not isinstance(found, torch.Tensor) or found.shape:
         kind = f"{list(found.shape)}" if isinstance(found, torch.Tensor) else type(found).__name__
         raise StageFailed(
             f"penalty {name!r} returned {kind}, not a scalar tensor", "return one, as mean() does"
         )
-    if differentiable and not found.requires_grad:
+    if weighed and not found.requires_grad:
         raise StageFailed(
             f"penalty {name!r} has no gradient, so it would change nothing",
             "compute it from its Samples, without detach() or item()",

@@ -1,7 +1,8 @@
 """Penalties: terms that are added to the risks, times lambda. One small file each; no torch is loaded.
 
 A penalty of adversarial learners is a function ``discriminator(samples, options)`` of
-:class:`Samples` to a scalar tensor, differentiable in the discriminator's weights.
+:class:`Samples` to a scalar tensor, differentiable in the discriminator's weights. A constant is
+refused at lambda > 0.
 
 A penalty of MaxEnt IRL is a function ``occupancy(at)`` of :class:`Occupancies` to a value [R, K]
 and its gradient with respect to phi [R, K, S].

@@ -31,7 +31,7 @@ def discriminator(samples: Samples, options: PenaltyOptions) -> torch.Tensor:
     """
     risks, weights = samples.risks, samples.weights
     if options.weight == 0.0 or not weights.any():
-        return risks.new_zeros(())
+        return 0.0 * risks.sum()
     shares = weights.sum() * (weights.log() + options.weight * risks.detach()).softmax(0)
     return ((shares - weights) * risks).sum() / options.weight
 

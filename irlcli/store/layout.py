@@ -93,7 +93,8 @@ class Layout(NamedTuple):
 
 def store_around(path: Path) -> Path | None:
     """The store that holds ``path``, an artefact's directory or a file directly in one, if any does."""
-    if not path.exists():
+    # Unlike Path.exists(), it does not raise for a name that no file system can hold.
+    if not os.path.exists(path):
         return None
     around = path.absolute().parents[:2]
     return next((root for root in around if Layout(root).marker.is_file()), None)

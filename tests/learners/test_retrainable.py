@@ -369,7 +369,7 @@ def test_the_share_of_challengers_is_taken_from_the_student(demos, share):
     torch.testing.assert_close(total, (1.0 - share) * own + share * other)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.9])
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.0])
 def test_group_dro_divides_what_challengers_leave_among_the_settings(demos, share):
     """The loss is (1 - share) sum q_e R_e, with q_e proportional to exp(50 R_e), and the challengers'."""
     challenger = replace(CHALLENGED["challenger"], share=share)

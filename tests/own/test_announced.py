@@ -185,8 +185,20 @@ def test_a_helper_that_python_imports_from_elsewhere_is_refused(lab, monkeypatch
         digest(lab)
     (lab / "other" / "lab_physics.py").unlink()
     assert digest(lab) == before
-    # Python's own library precedes every file.
-    (lab / "json.py").write_text("")
+    # Python's own library precedes the directory, which is last on its path,
+    for module in ("json", "this"):
+        (lab / "lab_env.py").write_text(f"import lab_physics\nimport {module}\n")
+        before = digest(lab)
+        (lab / f"{module}.py").write_text("")
+        assert digest(lab) == before
+    # but not one that is named first.
+    monkeypatch.syspath_prepend(lab)
+    assert digest(lab) != before
+    # An installed package precedes a folder of data.
+    (lab / "lab_env.py").write_text("import numpy\n")
+    before = digest(lab)
+    (lab / "numpy").mkdir()
+    (lab / "numpy" / "saved.py").write_text("")
     assert digest(lab) == before
 
 

@@ -20,7 +20,7 @@ from irlcli.envs import registration, registry
 from irlcli.envs.registration import make
 from irlcli.envs.registry import resolve
 from irlcli.errors import NotFound, StageFailed
-from irlcli.interventions import Setting
+from irlcli.interventions import Setting, env_kwargs, parse_setting
 from irlcli.rl.rollout import roll_out
 from irlcli.store import Store
 
@@ -301,6 +301,10 @@ def test_a_whole_number_reaches_the_constructor_as_an_int(bench):
     one = ("--env", "cart.toml", "--intervention", "drag=2", "--profile", "smoke")
     done = bench.irl("evaluate", "--idle", *one)
     assert done.code == 0, done.err
+    bench.edit(bench.toml, 'forms = ["absolute"]', 'forms = ["absolute", "range"]')
+    env = resolve("cart.toml").name
+    (given,) = env_kwargs(env, parse_setting(env, "drag=1..2")).values()
+    assert given == (1, 2) and {type(x) for x in given} == {int}
 
 
 def test_seeds_share_a_row_however_many_settings_each_was_evaluated_in(bench):
