@@ -260,7 +260,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         columns: the entries of the observation that the reward sees, as indices; negative ones count
             from the end. The policy sees all. Empty is all.
         averaged_rounds: the reward that leaves training is the mean of g after so many rounds,
-            spaced as ``averaged_by`` says, up to the last. Each represents the rounds since the one before; early ones may lie in the penalty's warm-up. 1 is the last g alone.
+            spaced as ``averaged_by`` says, up to the last. Each represents the rounds since the one
+            before; early ones may lie in the penalty's warm-up. 1 is the last g alone.
         averaged_by: the space between these rounds: the same number of ``rounds``, or the same sum of
             the discriminator's ``learning-rate``, so that early rounds count more when it falls.
         plateau_rounds: training ends before ``total_steps`` when the discriminator's cross-entropy is
