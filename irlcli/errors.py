@@ -88,17 +88,26 @@ def imported(what: str, place: str) -> Any:
     """The object at ``place`` (``module`` or ``module:name``), which ``what`` is registered with.
 
     Raises:
-        StageFailed: it or what it imports is not installed, or it has no such name.
+        StageFailed: it or what it imports is not installed, it has no such name, or it is not Python.
     """
     from pkgutil import resolve_name
 
     try:
         return resolve_name(place if ":" in place else f"{place}:")
     except (ImportError, AttributeError, SyntaxError) as error:
-        raise StageFailed(
-            f"{what}: {place} cannot be imported ({error})",
-            "install its package, or name its folder in PYTHONPATH; or correct the registered name",
-        ) from error
+        hint = (
+            "install its package, or name its folder in PYTHONPATH; or correct the registered name"
+        )
+        message = str(error)
+        if isinstance(error, SyntaxError):
+            message, hint = f"{error.msg}", f"correct {error.filename}, line {error.lineno}"
+        elif (
+            isinstance(error, ImportError)
+            and error.name
+            and not f"{place}:".startswith((f"{error.name}.", f"{error.name}:"))
+        ):
+            hint = f"the module imports {error.name}: install that, or correct the import"
+        raise StageFailed(f"{what}: {place} cannot be imported ({message})", hint) from error
 
 
 def file_failure(error: OSError) -> StageFailed:
@@ -116,6 +125,31 @@ def described(error: BaseException) -> str:
     """The class of any exception, and the first line of its message if it has one."""
     name = type(error).__name__
     return f"{name}: {first_line(error)}" if str(error).strip() else name
+
+
+def own_line(error: BaseException) -> str:
+    """``FILE, line N``: the last line outside this package and Python's libraries that led to ``error``.
+
+    Empty if there is none.
+    """
+    import os
+    import sysconfig
+    import traceback
+    from pathlib import Path
+
+    installed = (
+        sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    )
+    paths = [os.path.dirname(__file__), *installed]
+    libraries = tuple(os.path.realpath(path) + os.sep for path in paths)
+    places = [
+        f"{frame.filename}, line {frame.lineno}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if os.path.isfile(frame.filename)
+        and not os.path.realpath(frame.filename).startswith(libraries)
+        and {"site-packages", "dist-packages"}.isdisjoint(Path(frame.filename).parts)
+    ]
+    return places[-1] if places else ""
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:

@@ -16,6 +16,7 @@ from irlcli.errors import (
     UsageError,
     described,
     file_failure,
+    own_line,
 )
 
 
@@ -74,47 +75,36 @@ def _main() -> None:
     except Exception as error:
         if hasattr(error, "format_message"):
             _fail(_usage(error))
-        place = _own_code(error)
+        place = own_line(error)
         if place:
             _fail(
                 StageFailed(
-                    f"{place} raised {described(error)}",
+                    f"{place}, raised {described(error)}",
                     "this is code of your own: --debug shows the traceback",
                 )
             )
+        own = _registered()
+        first = f"if it is not the interface of {', '.join(own)}, registered here, " if own else ""
         _fail(
             StageFailed(
                 f"unexpected {described(error)}",
-                "this is a defect of irl: run again with --debug and report the traceback",
+                f"{first}this is a defect of irl: run again with --debug and report the traceback",
             )
         )
 
 
-def _own_code(error: Exception) -> str:
-    """The line that raised ``error``, if code outside this package and Python's libraries was called.
+def _registered() -> list[str]:
+    """Where the penalties, learners and algorithms are that are not part of this package."""
+    from irlcli.learners import LEARNERS
+    from irlcli.penalties import PENALTIES
+    from irlcli.rl import ALGORITHMS
 
-    Empty if none was.
-    """
-    import os
-    import sysconfig
-    import traceback
-    from pathlib import Path
-
-    import irlcli
-
-    installed = (
-        sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    places = (
+        *(penalty.module for penalty in PENALTIES.values()),
+        *(learner.place for learner in LEARNERS.values()),
+        *ALGORITHMS.values(),
     )
-    paths = [os.path.dirname(irlcli.__file__), *installed]
-    libraries = tuple(os.path.realpath(path) + os.sep for path in paths)
-    places = [
-        f"{frame.filename}, line {frame.lineno},"
-        for frame in traceback.extract_tb(error.__traceback__)
-        if os.path.isfile(frame.filename)
-        and not os.path.realpath(frame.filename).startswith(libraries)
-        and {"site-packages", "dist-packages"}.isdisjoint(Path(frame.filename).parts)
-    ]
-    return places[-1] if places else ""
+    return sorted(place for place in places if not place.startswith("irlcli."))
 
 
 def _interrupted() -> Interrupted:

@@ -5,7 +5,7 @@ import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 
@@ -89,8 +89,17 @@ def converted(value: Any, form: type[Form], where: str, examples: str) -> Form:
         if missing:
             raise UsageError(f"{where}.{missing[1]} is missing", f"write it in [{where}]") from None
         raise UsageError(
-            f"{where}{f'.{field}' if field else ''}: {of_types(message)}", f"see {examples}"
+            f"{where}{f'.{field}' if field else ''}: {of_types(message)}",
+            _choices(form, field) or f"see {examples}",
         ) from None
+
+
+def _choices(form: type[Any], field: str) -> str:
+    """The choices of a field that has some, else empty."""
+    kinds = {f.name: f.type for f in msgspec.structs.fields(form)}
+    members = get_args(kinds.get(field))
+    choices = next((get_args(m) for m in members if get_origin(m) is Literal), ())
+    return f"one of: {', '.join(choices)}" if choices else ""
 
 
 def with_key(value: Mapping[str, Any], form: type[Form], field: str) -> str:

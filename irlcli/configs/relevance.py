@@ -250,7 +250,7 @@ def relevant_transfer(
 
     Raises:
         UsageError: an unknown algorithm, or one or an option that does not fit the actions or the
-            start, restarts longer than the budget, or SAC whose budget ends before its first update.
+            start, restarts longer than the budget, or a budget that leaves no update.
     """
     _check_known("transfer.algorithm", transfer.algorithm, ALGORITHMS)
     if from_student or transfer.restarts in (UNSET, 1):
@@ -289,6 +289,7 @@ def relevant_transfer(
             ),
         )
     ppo = relevant_ppo(transfer.ppo, discrete_actions, "transfer.ppo")
+    _check_rate(ppo, transfer.total_steps, from_student)
     return replace(transfer, ppo=ppo, sac=_TRANSFER.sac, from_student=_TRANSFER.from_student)
 
 
@@ -299,6 +300,18 @@ def _check_updated(sac: SACConfig, total_steps: int) -> None:
             f"transfer.sac.learning_starts = {sac.learning_starts} leaves no update: training has "
             f"{steps} steps",
             f"--set transfer.sac.learning_starts={steps - 1} or less, or more transfer.total_steps",
+        )
+
+
+def _check_rate(ppo: PPOConfig, total_steps: int, from_student: bool) -> None:
+    """Refuse a single rollout at a linear rate: after it, the rate is zero and nothing is learned."""
+    rollout = ppo.n_envs * ppo.n_steps
+    if ppo.learning_rate_schedule == "linear" and total_steps <= rollout:
+        budget = "transfer.from_student.total_steps" if from_student else "transfer.total_steps"
+        raise UsageError(
+            f"{budget} = {total_steps} leaves no update: a learning rate that falls to zero needs more "
+            f"than one rollout, here of {rollout} steps",
+            f"--set {budget}={2 * rollout} or more, or fewer transfer.ppo.n_steps",
         )
 
 

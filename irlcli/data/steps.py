@@ -150,12 +150,14 @@ class Irregular:
     Attributes:
         cut: cut an episode at the horizon, count one without an end as truncated, and leave an
             empty one out. Otherwise each of them is refused.
+        terminated_at_limit: whole episodes that are terminated in their last possible step.
     """
 
     cut: bool
     long: int = 0
     unended: int = 0
     empty: int = 0
+    terminated_at_limit: int = 0
 
     def found_empty(self, place: str) -> None:
         """An episode without steps.
@@ -241,6 +243,9 @@ class Check:
         at_limit = (t == self.horizon - 1) & ~ended
         self.irregular.long += int((at_limit & ~last).sum())
         self.irregular.unended += int(unended.sum())
+        self.irregular.terminated_at_limit += int(
+            (steps.terminated & (t == self.horizon - 1)).sum()
+        )
         self._t = int(t[-1]) + 1
         self._ended, self._setting = bool(ended[-1]), int(steps.settings[-1])
         self._next = steps.next_observations[-1]

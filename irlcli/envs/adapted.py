@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
-from irlcli.errors import StageFailed, UsageError, described, first_line
+from irlcli.errors import StageFailed, UsageError, described, first_line, own_line
 
 # The largest that the description of a reward or a policy may hold.
 _LARGEST_OBSERVATION = 4096
@@ -68,10 +68,21 @@ class Adapted(gymnasium.Wrapper):
     @prints_aside()
     def step(self, action: Any) -> Any:
         try:
-            observation, reward, terminated, truncated, info = self.env.step(self._taken(action))
-            reward = float(reward)
+            found = self.env.step(self._taken(action))
         except (Exception, SystemExit) as error:
             raise self._failed("step", error) from error
+        if not isinstance(found, tuple) or len(found) != 5:
+            what = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
+            raise self._wrong(
+                "step", f"returned {what}, not (observation, reward, terminated, truncated, info)"
+            )
+        observation, reward, terminated, truncated, info = found
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError) as error:
+            raise self._wrong(
+                "step", f"returned the reward {reward!r}: it must be a number"
+            ) from error
         if not abs(reward) <= _LARGEST_REWARD:
             raise self._wrong("step", f"returned the reward {reward}: it must be finite in float32")
         info = self._reported(info)
@@ -133,7 +144,8 @@ class Adapted(gymnasium.Wrapper):
         return found | {"progress": float(progress)} if "progress" in info else found
 
     def _failed(self, method: str, error: BaseException) -> StageFailed:
-        return self._wrong(method, f"raised {described(error)}")
+        line = own_line(error)
+        return self._wrong(method, f"raised {described(error)}{f' ({line})' if line else ''}")
 
     def _wrong(self, method: str, what: str) -> StageFailed:
         return StageFailed(

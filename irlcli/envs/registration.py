@@ -21,7 +21,15 @@ from irlcli.envs.cue import CueWorld
 from irlcli.envs.own import check_code, module_of
 from irlcli.envs.registry import ENVIRONMENTS, environment
 from irlcli.envs.spec import Code, Cue, EnvironmentSpec, Own
-from irlcli.errors import IrlError, StageFailed, UsageError, described, first_line, imported
+from irlcli.errors import (
+    IrlError,
+    StageFailed,
+    UsageError,
+    described,
+    first_line,
+    imported,
+    own_line,
+)
 from irlcli.interventions import Setting, cue_in, env_kwargs, without_cue
 
 # What this process imported, as it was then: Python imports a module once.
@@ -186,7 +194,15 @@ def _import(spec: EnvironmentSpec, own: Own) -> None:
     alone, with_files = (module, ()), (module, own.files)
     if with_files not in _imported:
         check_code(spec)
-        import_module(module)
+        try:
+            import_module(module)
+        except (Exception, SystemExit) as error:
+            line = own_line(error)
+            raise UsageError(
+                f"{own.source}: {module} cannot be imported: {described(error)[:300]}"
+                f"{f' ({line})' if line else ''}",
+                "correct the module, or install what it imports",
+            ) from error
         _imported[with_files] = code_of(module, own.files, own.directory, own.source)
         now = code_of(module, (), own.directory, own.source)
         if _imported.setdefault(alone, now) != now:

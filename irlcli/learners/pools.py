@@ -100,8 +100,8 @@ def sample_minibatch(
 ) -> Minibatch:
     """Samples of either label for each risk, with replacement.
 
-    A share of ``past_share`` of the policy's samples comes from earlier rounds: otherwise the
-    discriminator forgets what the policy no longer does.
+    About ``past_share`` of the policy's samples, in each stratum an even number, come from earlier
+    rounds: otherwise the discriminator forgets what the policy no longer does.
     """
 
     def draw(pool: Pool, count: int) -> list[torch.Tensor]:

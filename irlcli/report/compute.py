@@ -7,7 +7,7 @@ Most functions take *points*: a row per evaluation and setting with the columns
     measure       see :class:`irlcli.report.parameters.Cell`
     seed          of the reward learning; missing for baselines
     retraining    number of the policy trained on that seed's reward, from 0
-    expert_of     the setting in which an expert was trained
+    expert_of     the setting in which an expert was trained; of ``reused``, never ``setting``
     setting       the setting of the evaluation
     true_return, progress, learned_return
                   means over episodes. Progress may be missing. The learned return is known only

@@ -32,7 +32,7 @@ class Cell(msgspec.Struct, frozen=True):
     Attributes:
         row: ``ENV KNOB``.
         agent: a method, ``expert``, ``random``, ``idle``, or ``reused``: the expert of a training
-            setting, evaluated in the settings in which the students are evaluated.
+            setting, evaluated in the other settings in which the students are evaluated.
         measure: ``transfer`` (the retrained policy), ``from-student`` (retrained from the student
             on), ``transfer-id`` (retrained in a training setting, ``place``), ``zero-shot`` or
             ``id`` (the student, in the held-out setting or in distribution), ``ood`` for an agent

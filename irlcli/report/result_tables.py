@@ -22,7 +22,7 @@ from irlcli.report.text import number, p_value, percent
 
 _MAIN_NOTE = (
     "Mean true return ± standard deviation over seeds. Training experts, reused: the mean over the "
-    "experts of the training settings, each evaluated in the settings in which the students are "
+    "experts of the training settings, each evaluated in the other settings in which the students are "
     "evaluated. This is the return without learning a reward."
 )
 _TEST_NOTE = (
@@ -88,8 +88,9 @@ _DISCRIMINATOR_NOTE = (
     "Over the last tenth of the rounds, means over settings and seeds. This round: after the update, on "
     "a new minibatch of the round's episodes and the demonstrations, which the update used; the penalty "
     "is IRMv1, also for methods that do not penalise it. Optimised: means over the update's minibatches, "
-    "which hold replayed episodes; challengers and the gradient penalty are not included. Share: lambda "
-    "times the optimised penalty over the optimised cross-entropy. The unbiased estimate of the penalty "
+    "which hold replayed episodes; challengers and the gradient penalty are not included. With symmetries they are random "
+    "images; the samples of *this round* are as recorded. Share: lambda times "
+    " the optimised penalty over the optimised cross-entropy. The unbiased estimate of the penalty "
     "may be negative. Where --select kept an earlier round, or rounds were averaged, these are still the "
     "last rounds. If the discriminator is always right, the penalty has nothing to change."
 )
@@ -98,7 +99,7 @@ _CELL_NOTE = (
     "mean of the middle half of the seeds. Retrainings: standard deviation between policies "
     "trained on one reward, pooled over rewards; the sd over seeds is of their means. Random and idle are one policy "
     "each, and so is the held-out setting's expert; in distribution there is one expert per training setting, "
-    "and the reused experts are these."
+    "and the reused experts are these, each in the other settings."
 )
 _BUDGET_NOTE = (
     "Steps: the budget in whole rounds; the steps of challengers are not counted. "

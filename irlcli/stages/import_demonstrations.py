@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from irlcli.trajectories import ActionSpace
 
 Form = Literal["parquet", "minari", "imitation"]
+# Actions that are so many times as far from the middle as their bounds were not sampled by a policy.
+_FAR = 10
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -113,7 +115,7 @@ def run(job: Job) -> None:
     irregular = Irregular(p.cut)
     expected = Expected(env, p.settings, p.setting_column, horizon, actions, irregular)
     check = Check(horizon, bounds.shape[1], actions, f"{env} {p.settings[0]}", irregular, start)
-    parts = _bounded(job, check(_read(job.inputs, p, expected)), bounds)
+    parts = _bounded(job, check(_read(job.inputs, p, expected)), bounds, actions)
     written = write_stream(job.output, env, settings, parts, {"imported": p.form})
     for index, text in enumerate(p.settings):
         if not (written.settings == index).any():
@@ -123,13 +125,28 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", summary)
 
 
-def _bounded(job: Job, parts: Iterator[Steps], bounds: np.ndarray) -> Iterator[Steps]:
-    """``parts``, and in the end a warning of observations outside ``bounds`` [2, D]."""
-    outside = total = 0
+def _bounded(
+    job: Job, parts: Iterator[Steps], bounds: np.ndarray, actions: ActionSpace
+) -> Iterator[Steps]:
+    """``parts``, and in the end a warning of observations outside ``bounds`` [2, D] and of far actions.
+
+    An action beyond its bounds is no mistake: policies sample such actions, and environments clip them.
+    """
+    import numpy as np
+
+    outside = far = total = 0
     for part in parts:
         beyond = (part.observations < bounds[0]) | (part.observations > bounds[1])
         outside, total = outside + int(beyond.any(-1).sum()), total + len(part)
+        if not actions.discrete:
+            middle, reach = (actions.high + actions.low) / 2, (actions.high - actions.low) / 2
+            far += int((np.abs(part.actions - middle) > _FAR * reach).any(-1).sum())
         yield part
+    if far:
+        job.console.warn(
+            f"{far:,} of {total:,} steps have actions more than {_FAR} times as far out as their bounds: "
+            "check their units"
+        )
     if outside:
         job.console.warn(
             f"{outside:,} of {total:,} steps have observations outside the environment's bounds: check "
@@ -203,6 +220,11 @@ def _report(job: Job, irregular: Irregular, written: Written) -> None:
         if count:
             episodes = "episode" if count == 1 else "episodes"
             job.console.warn(f"{count} {episodes} {what}")
+    if irregular.terminated_at_limit:
+        job.console.warn(
+            f"{irregular.terminated_at_limit} of {len(written.lengths)} episodes are terminated in the last "
+            "step that the time limit allows: if the time limit ended them, write truncated instead"
+        )
 
 
 def _means(index: int, text: str, written: Written) -> dict[str, Any]:

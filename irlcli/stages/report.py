@@ -105,6 +105,8 @@ def _points(job: Job) -> list[dict[str, Any]]:
                 "evaluation": cell.run,
             }
             for place in summary.settings
+            # In its own setting an expert is what the others are compared with, not a baseline.
+            if cell.agent != "reused" or place.setting != cell.place
         ]
     return points
 
@@ -215,4 +217,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 33, run)
+STAGE = Stage("report", 34, run)

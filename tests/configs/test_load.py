@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from irlcli.configs import PROFILES, Config, PPOConfig, load_config
 from irlcli.configs.relevance import relevant_airl, relevant_ppo, relevant_transfer
-from irlcli.configs.schema import SACConfig, TransferConfig
+from irlcli.configs.schema import FromStudentConfig, SACConfig, TransferConfig
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import parse_settings
@@ -573,6 +573,15 @@ def test_a_training_without_an_update_is_refused():
         relevant(replace(sac, sac=begins[1]))
     with pytest.raises(UsageError, match=r"transfer\.ppo: one world and one step"):
         relevant(TransferConfig(ppo=PPOConfig(n_envs=1, n_steps=1)))
+    falling = PPOConfig(n_envs=2, n_steps=100, learning_rate_schedule="linear")
+    relevant(TransferConfig(total_steps=201, ppo=falling))
+    with pytest.raises(UsageError, match=r"transfer\.total_steps = 200 leaves no update"):
+        relevant(TransferConfig(total_steps=200, ppo=falling))
+    rounds = TransferConfig(total_steps=1, ppo=replace(falling, learning_rate_schedule="constant"))
+    relevant(rounds)
+    student = replace(rounds, from_student=FromStudentConfig(total_steps=200))
+    with pytest.raises(UsageError, match=r"transfer\.from_student\.total_steps = 200 leaves no"):
+        relevant(student, from_student=True)
 
 
 def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():

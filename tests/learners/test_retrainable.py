@@ -161,16 +161,27 @@ def test_balanced_settings_share_the_risk_that_is_penalised(demos, grouping, mer
     assert found.penalty.item() == pytest.approx(one) != pytest.approx(other)
 
 
-def test_a_linear_schedule_ends_at_zero(demos):
-    trainer, learner = make(demos, ppo=LONG, horizon=HORIZON, learning_rate_schedule="linear")
-    (rollout,) = trainer.train_round(0, learner)
-    moved = []
-    for index in (0, trainer.rounds):
+def test_a_linear_schedule_falls_towards_zero_and_the_last_round_still_learns(demos):
+    def moved(index):
+        trainer, learner = make(
+            demos,
+            ppo=LONG,
+            horizon=HORIZON,
+            learning_rate_schedule="linear",
+            learning_rate=1e-6,
+            updates_per_round=1,
+        )
+        (rollout,) = trainer.train_round(0, learner)
         before = [p.detach().clone() for p in learner.model.parameters()]
         learner.update(index, [rollout], trainer.policy)
         after = list(learner.model.parameters())
-        moved.append(max(float((a - b).abs().max()) for a, b in zip(after, before, strict=True)))
-    assert moved[0] > 0.0 and moved[1] == 0.0
+        return max(float((a - b).abs().max()) for a, b in zip(after, before, strict=True))
+
+    rounds = make(demos, ppo=LONG, horizon=HORIZON)[0].rounds
+    assert rounds > 2
+    # Adam's first step is the learning rate.
+    for index in (0, 1, rounds - 1):
+        assert moved(index) == pytest.approx(1e-6 * (1 - index / rounds), rel=0.2)
 
 
 # Challengers
