@@ -7,7 +7,7 @@ assumed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from irlcli.methods import method_name
@@ -15,6 +15,7 @@ from irlcli.methods import method_name
 if TYPE_CHECKING:
     # The command line's console imports this module at every start.
     from irlcli.store import KeyRecord
+    from irlcli.store.manifest import Manifest
 
 _MAX_LENGTH = 200
 _LARGEST = 2**53
@@ -48,11 +49,15 @@ def environment_of(parameters: Mapping[str, Any]) -> Any:
     return environment.get("name") if isinstance(environment, dict) else parameters.get("env")
 
 
+def makers(manifests: Iterable[Manifest]) -> dict[str, KeyRecord]:
+    """The record of the stage that made each output, by the output's sha256."""
+    return {output.sha256: m.record for m in manifests for output in m.outputs}
+
+
 def origin(record: KeyRecord, makers: Mapping[str, KeyRecord]) -> str:
     """What an evaluation's policy and a retrained policy's reward were made from, if stored.
 
-    For a choice of lambda it is the method. ``makers`` maps the sha256 of every stored output to the
-    record of the stage that made it.
+    For a choice of lambda it is the method. ``makers`` is of :func:`makers`.
     """
     if record.stage == "choose-penalty":
         return _method_of_choice(record, makers)

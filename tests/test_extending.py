@@ -11,6 +11,7 @@ import pytest
 
 from irlcli import learners, penalties, rl
 from irlcli.envs import registry
+from irlcli.errors import StageFailed
 from irlcli.experiments.references import demonstrations
 from irlcli.experiments.runner import Runner
 from irlcli.store import Store
@@ -126,6 +127,36 @@ def test_a_mistake_in_a_penalty_is_named(irl, lab, store_copy, monkeypatch, code
     assert done.code == 1 and said in done.err, done.err
     assert done.err.count("error:") == 1 and "hint:" in done.err and "defect" not in done.err
     assert not list((store_copy.path / ".work").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("code", "hint"),
+    [
+        (PENALTY.replace("):", ")"), "wrong.py, line 4"),
+        ("import nothing_here", "the module imports nothing_here"),
+        ("def penalty(samples, options): ...", "correct the registered name"),
+    ],
+)
+def test_the_hint_says_what_to_correct_in_a_module(lab, monkeypatch, code, hint):
+    (lab("risk_range.py").parent / "wrong.py").write_text(code)
+    monkeypatch.setitem(penalties.PENALTIES, "wrong", penalties.Penalty("lab.wrong", ("airl",)))
+    with pytest.raises(StageFailed) as caught:
+        penalties.discriminator_penalty("wrong")
+    assert hint in caught.value.hint
+
+
+def test_an_interface_that_is_not_kept_is_not_called_a_defect_alone(
+    irl, lab, store_copy, monkeypatch
+):
+    (lab("risk_range.py").parent / "wrong.py").write_text(
+        PENALTY.replace(", options", "").format(0)
+    )
+    line = ["train-airl", "--demos", "demos", "--grouping", "per-setting", "--penalty", "wrong"]
+    line += ["--store", store_copy.path, "--profile", "smoke", "--quiet"]
+    monkeypatch.setitem(penalties.PENALTIES, "wrong", penalties.Penalty("lab.wrong", ("airl",)))
+    done = irl(*line)
+    assert done.code == 1 and "takes 1 positional argument but 2 were given" in done.err
+    assert "lab.wrong" in done.err.partition("hint:")[2], done.err
 
 
 def test_an_option_that_no_penalty_can_read_is_refused(irl, store_copy, monkeypatch):

@@ -39,7 +39,7 @@ def ls(
         names.setdefault(id16, []).append(name)
     index = store.index()
     stored = list(index.artefacts.values())
-    makers = {o.sha256: a.manifest.record for a in stored for o in a.manifest.outputs}
+    makers = labels.makers(artefact.manifest for artefact in stored)
     found: list[dict[str, Any]] = [
         {
             "id": artefact.id,

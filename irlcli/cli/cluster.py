@@ -315,4 +315,5 @@ def cancel(session: StageSession, plan: "Plan", options: ClusterOptions) -> None
         out.print_json("cancel", {"table": plan.table.name, "jobs": len(there)})
         return
     after = "; those that ran leave a checkpoint" if there else ""
+    after += ". An `irl run` that waits starts the next steps: stop it with Ctrl-C"
     out.print_note(f"{out.counted(len(there), 'job')} cancelled{after}")

@@ -129,6 +129,8 @@ def gc(
 
     session.check_exists()
     grace = grace_days * _DAY
+    stored = session.store.index().artefacts.values()
+    makers = labels.makers(artefact.manifest for artefact in stored)
     if delete:
         # First of all: whoever submits jobs may hold it for long, and then nothing is deleted.
         with session.store.working_on(LOCK, wait=False, what="a submission of jobs"):
@@ -148,7 +150,8 @@ def gc(
         return
     for artefact in artefacts:
         record = artefact.manifest.record
-        out.print_data(f"{artefact.id}  {record.stage}  {labels.describe(record)}")
+        about = labels.describe(record) + labels.origin(record, makers)
+        out.print_data(f"{artefact.id}  {record.stage}  {about}")
     for path in work:
         out.print_data(f"{path.name[:16]}  scratch of an interrupted run")
     for path in submissions:

@@ -121,7 +121,7 @@ def of_types(message: str) -> str:
         return f"expected {_KINDS[kind]} {_BOUNDS[sign]} {number.removesuffix('.0')}"
     found = re.match("Expected `([^`]+)`, got `([^`]+)`$", message)
     if found is None:
-        return message
+        return message.replace("Invalid enum value", "unknown value")
     expected, got = (
         " or ".join(_KINDS.get(kind, kind) for kind in kinds.split(" | "))
         for kinds in found.groups()

@@ -16,7 +16,7 @@ from irlcli.envs.adapted import Adapted, prints_aside
 from irlcli.envs.declared_symmetries import symmetries
 from irlcli.envs.registration import make
 from irlcli.envs.spec import EnvironmentSpec, Knob
-from irlcli.errors import IrlError, first_line
+from irlcli.errors import IrlError, UsageError, first_line
 from irlcli.interventions import Setting, Value
 
 _MOST_STEPS = 200
@@ -72,6 +72,8 @@ def _outcome(what: str, run: Callable[[], object]) -> Found:
         try:
             run()
             wrong = ""
+        except UsageError as error:
+            wrong = f"{error.message}; {error.hint}"
         except (_Wrong, IrlError) as error:
             wrong = first_line(error)
     own = [w.message for w in caught if isinstance(w.message, UserWarning)]

@@ -86,7 +86,7 @@ class StageCheckpoints:
                 raise KeyboardInterrupt
             self.stop_requested = True
             self._console.warn(
-                "stopping at the end of this round or stage (repeat the signal to stop at once)"
+                "stopping at the end of this round or stage (a second signal stops at once)"
             )
 
         return stop_requests(handle)

@@ -95,7 +95,7 @@ def output_problem(directory: Path, output: Output, quick: bool = False) -> str 
         if information.st_size != output.size:
             return f"{path} has {information.st_size} bytes instead of {output.size}"
         if not quick and file_digest(path) != output.sha256:
-            return f"{path} differs from the published bytes"
+            return f"{path} is not the file that was stored: its sha256 differs"
     except OSError as error:
         return f"{path} cannot be read ({error.strerror})"
     return None

@@ -79,17 +79,17 @@ def _below(root: str, path: str) -> str | None:
 
 def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     """Why ``ref`` names nothing; ``text`` is what it would be inside the store."""
+    pull = shlex.join(["irl", "pull", "NAME", "--from", "STORE", *layout.option])
     if not layout.root.exists():
         return NotFound(
             f"{ref!r} names no file, and there is no store at {layout.root}",
-            "name another store with --store or IRL_STORE",
+            f"name another store with --store or IRL_STORE; `{pull}` copies it into a new one",
         )
     from irlcli.store.integrity import quarantined
 
     head = text.partition("/")[0]
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
-    pull = shlex.join(["irl", "pull", "NAME", "--from", "STORE", *layout.option])
     listing = f"{layout.listing}, `{pull}` copies one from another store"
     close = closest(head, names(layout))
     if close is not None:

@@ -123,7 +123,9 @@ def verified(source: Place, id16: str, output: Output) -> Iterator[bytes]:
             break
         yield chunk
     if left != 0 or hasher.hexdigest() != output.sha256:
-        raise IntegrityError(f"{source.root}/{id16}/{output.path} differs from the published bytes")
+        raise IntegrityError(
+            f"{source.root}/{id16}/{output.path} is not the file that was stored: its sha256 differs"
+        )
 
 
 def check(source: Place, id16: str, manifest: Manifest) -> None:

@@ -222,7 +222,7 @@ def test_set_is_typed_by_its_field(item, value):
         ("airl.penalty_weight", "has no '='", "--set airl.penalty_weight=VALUE"),
         ("", "has no '='", "--set"),
         ("bc_epochs=2", "'bc_epochs'", "did you mean airl.bc_epochs?"),
-        ("airl.actions=samples", "Invalid enum value", "one of: sampled, executed"),
+        ("airl.actions=samples", "unknown value 'samples'", "one of: sampled, executed"),
         ("=3", "''", "known: "),
         ("airl=3", "group", "airl.grouping"),
         ("airl.ppo=3", "group", "airl.ppo.n_envs"),

@@ -8,6 +8,8 @@ from typing import ClassVar
 
 import gymnasium
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import irlcli
@@ -401,3 +403,57 @@ def test_a_knob_that_extends_the_observation_must_say_so(bench):
     bench.edit(bench.toml, 'argument = "drag"', 'argument = "drag"\nobserved = true')
     again = bench.irl("envs", "check", "cart.toml")
     assert again.code == 0, again.out
+
+
+def test_actions_in_other_units_and_a_time_limit_written_as_an_end_are_warned_of(bench):
+    made = bench.irl(*COLLECT, *ONE, "--name", "demos")
+    assert made.code == 0, made.err
+    assert bench.irl("export", "demos", "demos", "--to", "parquet:own.parquet").code == 0
+    table = pq.read_table("own.parquet")
+    plain = bench.irl("import", "own.parquet", "--env", "cart.toml", *ONE)
+    assert plain.code == 0 and "warning" not in plain.err
+    actions = [[1000.0 * a for a in row] for row in table["action"].to_pylist()]
+    ends = pa.array(np.asarray(table["terminated"]) | np.asarray(table["truncated"]))
+    for name, column in (("action", pa.array(actions)), ("terminated", ends)):
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    pq.write_table(table, "other.parquet")
+    done = bench.irl("import", "other.parquet", "--env", "cart.toml", *ONE)
+    assert done.code == 0, done.err
+    far = sum(abs(row[0]) > 10.0 for row in actions)
+    assert far and f"{far} of {len(table)} steps have actions more than 10 times" in done.err
+    limited = int(np.asarray(table["truncated"]).sum())
+    assert limited and f"{limited} of {limited} episodes are terminated in the last" in done.err
+
+
+def test_a_mistake_in_the_environments_code_is_named_by_its_line(bench):
+    bench.edit(bench.module, "reward = 1.0", "reward = self.prize")
+    line = next(
+        i for i, text in enumerate(bench.module.read_text().splitlines(), 1) if "prize" in text
+    )
+    done = bench.irl(*RANDOM, *ONE)
+    assert done.code == 1 and f"cart.py, line {line})" in done.err, done.err
+
+
+def test_a_module_that_cannot_be_imported_is_not_blamed_on_a_knob(bench):
+    bench.module.write_text(bench.module.read_text() + '\nraise RuntimeError("module")\n')
+    done = bench.irl(*RANDOM, *ONE)
+    assert done.code == 2 and "cart cannot be imported: RuntimeError: module" in done.err, done.err
+    assert "cart.py, line " in done.err and "mass_scale" not in done.err
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        (
+            "self._observation(), reward, abs(self.position) > 5.0, {}",
+            "returned 4 values, not (obs",
+        ),
+        ("None", "returned NoneType, not (obs"),
+        ('self._observation(), "much", False, False, {}', "the reward 'much': it must be a number"),
+    ],
+)
+def test_a_step_that_returns_something_else(bench, returned, said):
+    old = "self._observation(), reward, abs(self.position) > 5.0, False, {}"
+    bench.edit(bench.module, old, returned)
+    done = bench.irl(*RANDOM, *ONE)
+    assert done.code == 1 and said in done.err, done.err

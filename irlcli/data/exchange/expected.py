@@ -152,7 +152,7 @@ def numbers(column: pa.Array, name: str, place: Locate) -> np.ndarray:
             )
     else:
         raise UsageError(
-            f"{place(0)}: {name} is of type {str(kind)[:80]}, not a number or a list of numbers",
+            f"{place(0)}: {name} is of type {str(kind)[:80]}: it holds no numbers",
             "docs/data.md describes the columns",
         )
     if size == 0:
