@@ -47,6 +47,10 @@ class LearnedReward:
         self.discrete: bool = network.discrete
         self.choices: tuple[int, ...] = network.choices
 
+    def __repr__(self) -> str:
+        settings = ", ".join(self.settings)
+        return f"<LearnedReward {self.env} {settings}, {self.method}, seed {self.seed}>"
+
     def __call__(
         self,
         obs: np.ndarray,

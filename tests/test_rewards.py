@@ -146,7 +146,7 @@ def test_a_name_and_an_id_are_found_in_a_store(smoke_store):
 def test_errors_name_arguments_not_options(tmp_path):
     with pytest.raises(IrlError) as caught:
         irlcli.load_reward("irm", store=tmp_path / "none")
-    assert caught.value.hint == "name another store with store"
+    assert 'store="DIRECTORY"' in caught.value.hint
     for ref in (3, None, ["irm"]):
         with pytest.raises(UsageError, match="is not text or a path"):
             irlcli.load_reward(ref)

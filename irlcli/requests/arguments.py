@@ -227,10 +227,13 @@ def check_env(ref: str, learned: str, wanted: str | None) -> None:
         UsageError: another environment.
     """
     if wanted is not None and wanted != learned:
-        raise UsageError(
-            f"{ref!r} belongs to {learned}, not to {wanted}",
-            "omit --env; a copy of an environment's file is a new environment unless both set the same name in [env]",
-        )
+        hint = "omit --env"
+        if environment(wanted).own is not None:
+            hint += (
+                "; a copy of an environment's file is a new environment unless both set the same name "
+                "in [env]"
+            )
+        raise UsageError(f"{ref!r} belongs to {learned}, not to {wanted}", hint)
 
 
 def counts(text: str) -> tuple[int, ...]:

@@ -6,6 +6,7 @@ import re
 def in_python(text: str) -> str:
     """``--penalty-weight`` as ``penalty_weight``, except in command lines between backticks."""
     text = text.replace("the same command again", "the same call again")
+    text = text.replace("with --store or IRL_STORE", 'with store="DIRECTORY"')
     text = text.replace(" or IRL_STORE", "")
     return re.sub(
         r"`[^`]*`|--([a-z][a-z-]*)",

@@ -83,7 +83,7 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     if not layout.root.exists():
         return NotFound(
             f"{ref!r} names no file, and there is no store at {layout.root}",
-            f"name another store with --store or IRL_STORE; `{pull}` copies it into a new one",
+            f"choose another store with --store or IRL_STORE; `{pull}` copies it into a new one",
         )
     from irlcli.store.integrity import quarantined
 

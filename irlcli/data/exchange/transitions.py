@@ -62,7 +62,7 @@ def _columns(path: Path, found: Sequence[str], expected: Expected) -> list[str]:
     if missing:
         raise UsageError(
             f"{path} has no column {missing[0]!r}; it has: {', '.join(found)[:400]}",
-            "--setting-column names the settings' column; docs/data.md describes the others"
+            "--setting-column names the settings' column; or give a source for each setting"
             if missing[0] in setting
             else "docs/data.md describes the columns",
         )
