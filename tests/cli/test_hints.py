@@ -371,8 +371,8 @@ CHALLENGED = ("airl.challenger.life=1", "airl.logit=f", "airl.policy_reward=f")
         (ERM, ["airl.ppo.batch_size=99999"], {"airl.ppo.batch_size=99999": "1024"}),
         (
             "transfer --reward airl --ood 1.5x --start student",
-            ["transfer.total_steps=5", "transfer.from_student.total_steps=7"],
-            {"transfer.total_steps=5": "7"},
+            ["transfer.total_steps=5", "transfer.from_student.total_steps=2050"],
+            {"transfer.total_steps=5": "2050"},
         ),
         ("transfer --reward airl --ood 1.5x", ["transfer.ceiling=none"], {}),
         ("transfer --reward airl --ood 1.5x", ["expert.ppo.n_epochs=1"], {}),
