@@ -1,5 +1,6 @@
 """``collect-experts`` and ``import``: demonstrations."""
 
+import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -7,7 +8,7 @@ from irlcli.configs import Config
 from irlcli.configs.load import field_of
 from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.envs.registry import resolve
-from irlcli.errors import UsageError
+from irlcli.errors import IntegrityError, UsageError
 from irlcli.experiments.recordings import recorded
 from irlcli.experiments.references import output
 from irlcli.interventions import Setting, listed_settings, parse_setting, without_cue
@@ -36,6 +37,7 @@ def collect_experts(
         UsageError: no setting is named, or one is malformed or named twice; ``trust`` without
             ``expert``.
         NotFound: no such environment or expert.
+        IntegrityError: an expert's .zip that is no archive.
     """
     env = resolve(env).name
     if intervention is None and not setting:
@@ -57,7 +59,17 @@ def collect_experts(
     else:
         counts = _listed_counts(env, config, settings)
     experts, normalisers = arguments.experts(session.store, env, expert)
-    return collect_stage.request(env, settings, config, seed, counts, experts, trust, normalisers)
+    request = collect_stage.request(
+        env, settings, config, seed, counts, experts, trust, normalisers
+    )
+    # Other settings' experts may be trained for hours before these files are loaded.
+    for path in (source.path for source in experts.values()):
+        if path.suffix == ".zip" and not zipfile.is_zipfile(path):
+            raise IntegrityError(
+                f"{path} was not saved by stable-baselines3: it is no zip file",
+                "name a file that model.save() wrote",
+            )
+    return request
 
 
 def _listed_counts(env: str, config: Config, settings: Sequence[Setting]) -> Sequence[int]:

@@ -204,3 +204,11 @@ def test_a_wrong_expert_is_one_clear_line(bench, words, code, named):
     error, *rest = done.err.splitlines()
     assert (done.code, done.out) == (code, "") and named in error, done.err
     assert len(rest) == 1 and rest[0].startswith("hint: ")
+
+
+def test_a_file_that_is_no_archive_is_refused_before_other_experts_are_trained(bench):
+    (bench.directory / "text.zip").write_text("no archive")
+    given = ["--expert", "mass=1x=text.zip", "--trust", "--intervention", "mass=1x,2x"]
+    done = bench.irl(*COLLECT, *given)
+    assert done.code == 4 and "text.zip was not saved by stable-baselines3" in done.err
+    assert not list(Store("runs").artefacts())
