@@ -134,7 +134,7 @@ def _reason(plan: Plan, request: Request) -> str:
         return f"{stage} was interrupted or is running"
     if first.status == "FOUND":
         return f"{stage} is {first.why}, and `irl run` copies it"
-    return f"{stage} has not run"
+    return f"no result of {stage}"
 
 
 def _curve_role(cell: Cell, part: str) -> str:

@@ -221,7 +221,7 @@ def test_what_is_missing_is_said(report, table_store):
     said = caveats(done)
     assert any(n.startswith("Missing: lunar-lander bounce: 0 of ") for n in said)
     (mine,) = (n for n in said if n.startswith("Missing: lunar-lander engine-power"))
-    assert "transfer has not run: AIRL-IRM 1." in mine
+    assert "no result of transfer: AIRL-IRM 1." in mine
     assert any("one seed has no variance" in n for n in said if n.startswith("No p-value"))
     assert re.search(r"lunar-lander engine-power = 1.5x +return .*\(1/2\)", done.err)
 
@@ -270,7 +270,7 @@ def test_nothing_is_run(report, table_store):
     assert planned.out.startswith("RUN     report table1")
     assert set(Store(table_store).ids()) == before
     partly = report("table1", table_store, *ROW, seeds="0,1,2")
-    assert any("train-airl has not run: AIRL-ERM 2; AIRL-IRM 2" in n for n in caveats(partly))
+    assert any("no result of train-airl: AIRL-ERM 2; AIRL-IRM 2" in n for n in caveats(partly))
     made = set(Store(table_store).ids()) - before
     store = Store(table_store)
     assert {store.resolve(i).artefact.manifest.record.stage for i in made} == {"report"}
@@ -508,12 +508,12 @@ def test_the_experts_of_every_setting(irl, table_store, tmp_path):
         ]
         assert row[name] == pytest.approx(place["mean_return"], rel=1e-5)
     assert (row["steps"], row["episodes"], row["status"]) == (1024, 2, "done")
-    assert found.loc["bounce=0.9", "status"] == "train-expert has not run"
+    assert found.loc["bounce=0.9", "status"] == "no result of train-expert"
     assert pd.isna(found.loc["bounce=0.9", "true_return"])
     (missing,) = caveats(done)
     assert missing.startswith("Missing: the evaluations of 6 of 9 experts: lunar-lander bounce=0.1")
     assert (
-        "| lunar-lander bounce=0.9 | held out | train-expert has not run |"
+        "| lunar-lander bounce=0.9 | held out | no result of train-expert |"
         in (directory / "README.md").read_text()
     )
     again = irl("report", "experts", *ROW, *common)

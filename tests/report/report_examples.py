@@ -49,7 +49,7 @@ def example(values, **more):
         for index, value in enumerate(returns):
             seed = None if agent in BASELINES else index
             id16 = "" if value is None else f"{len(runs):016x}"
-            why = "train-airl has not run" if value is None else ""
+            why = "no result of train-airl" if value is None else ""
             cells.append(Cell(row, agent, measure, seed, run=id16, why=why))
             if id16:
                 runs[id16] = run_of(len(runs))

@@ -26,7 +26,7 @@ def ablation(returns, experts=EXPERTS, method="erm"):
 
     def add(agent, measure, setting, seed, value, progress, retraining=0):
         run = "" if value is None else f"{len(cells):016x}"
-        why = "" if run else "transfer has not run"
+        why = "" if run else "no result of transfer"
         place = setting if measure == "transfer-id" else ""
         cells.append(Cell(BOUNCE, agent, measure, seed, place, run, why, retraining))
         if run:

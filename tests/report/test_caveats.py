@@ -108,7 +108,7 @@ def test_missing_evaluations_and_tests():
     values[POWER, "irm", "transfer"] = [None] * 3
     found = build(*example(values), {}, {}).caveats
     (bounce,) = (c for c in found if c.startswith(f"Missing: {BOUNCE}: 24 of 26"))
-    assert "train-airl has not run: AIRL-IRM 1, 2." in bounce
+    assert "no result of train-airl: AIRL-IRM 1, 2." in bounce
     assert any(c.startswith(f"No p-value: {BOUNCE}: 1 of 3") for c in found)
 
 

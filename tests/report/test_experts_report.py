@@ -13,7 +13,7 @@ ROW = "lunar-lander bounce"
 CELLS = (
     Cell(ROW, "random", "id", place="", run="r"),
     Cell(ROW, "expert", "id", place="bounce=0.1", run="a"),
-    Cell(ROW, "expert", "ood", place="bounce=0.9", why="train-expert has not run"),
+    Cell(ROW, "expert", "ood", place="bounce=0.9", why="no result of train-expert"),
 )
 RUNS = {"a": run_of(0, inputs=("e",)), "e": run_of(1, "train-expert"), "r": run_of(2)}
 
@@ -46,7 +46,7 @@ def test_a_setting_has_its_experts_return_and_training():
     missing = found.loc["bounce=0.9"]
     assert missing["use"] == "held out" and pd.isna(missing["true_return"])
     table = experts.text_table(summarised())
-    assert [row[2] for row in table.rows] == ["250 ± 5", "train-expert has not run"]
+    assert [row[2] for row in table.rows] == ["250 ± 5", "no result of train-expert"]
 
 
 @pytest.mark.parametrize(("bar", "low"), [(200.0, 0), (260.0, 1)])
