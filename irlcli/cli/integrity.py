@@ -1,6 +1,7 @@
 """``irl verify`` and ``irl gc``: damaged and unused artefacts."""
 
 import shlex
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
@@ -11,7 +12,7 @@ from irlcli.cli.cluster import ended_submissions
 from irlcli.cli.options import collecting_command, store_command
 from irlcli.cli.session import Session
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.store import Index
+from irlcli.store import Artefact, Index
 
 _DAY = 86400.0
 
@@ -129,18 +130,20 @@ def gc(
 
     session.check_exists()
     grace = grace_days * _DAY
-    stored = session.store.index().artefacts.values()
-    makers = labels.makers(artefact.manifest for artefact in stored)
     if delete:
         # First of all: whoever submits jobs may hold it for long, and then nothing is deleted.
         with session.store.working_on(LOCK, wait=False, what="a submission of jobs"):
             artefacts, work = session.store.collect(grace)
             submissions = ended_submissions(session, grace)
             remove(submissions)
+        known: Iterable[Artefact] = artefacts
     else:
         submissions = ended_submissions(session, grace)
         with session.reading():
-            artefacts, work = session.store.garbage(grace), session.store.stale_work(grace)
+            index = session.store.index()
+            artefacts = session.store.garbage(grace, index)
+            work = session.store.stale_work(grace)
+        known = index.artefacts.values()
     size = sum(artefact.manifest.size for artefact in artefacts)
     if session.as_json:
         value = {"deleted": delete, "artefacts": [a.id for a in artefacts], "bytes": size}
@@ -148,6 +151,7 @@ def gc(
         value |= {"submissions": [path.name for path in submissions]}
         out.print_json("gc", value)
         return
+    makers = labels.makers(artefact.manifest for artefact in known)
     for artefact in artefacts:
         record = artefact.manifest.record
         about = labels.describe(record) + labels.origin(record, makers)

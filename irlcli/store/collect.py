@@ -44,14 +44,15 @@ class Missing(NamedTuple):
         return f"{id16} is missing{where}: {'; '.join(reasons)}"
 
 
-def garbage(layout: Layout, grace_seconds: float, warn: Callable[[str], None]) -> list[Artefact]:
-    """All artefacts but those that are kept.
+def garbage(
+    layout: Layout, index: Index, grace_seconds: float, warn: Callable[[str], None]
+) -> list[Artefact]:
+    """All artefacts of ``index`` but those that are kept.
 
     Kept are named artefacts, those younger than the grace period [s], what a checkpoint younger than
     that needs, artefacts of a newer schema, whatever their manifests mention, and the ancestors of
     all these.
     """
-    index = read_index(layout, warn)
     for name in damaged_names(layout):
         warn(f"{layout.names / name} is damaged: gc does not know what the name protects")
     for id16, lost in missing(layout, index).items():
@@ -137,7 +138,8 @@ def collect(
                 "name the artefact again: "
                 f"`{shlex.join(['irl', 'name', 'REF', damaged[0], *layout.option])}`",
             )
-        artefacts, stale = garbage(layout, grace_seconds, warn), stale_work(layout, grace_seconds)
+        artefacts = garbage(layout, read_index(layout, warn), grace_seconds, warn)
+        stale = stale_work(layout, grace_seconds)
         pointers: dict[str, list[Path]] = {}
         for pointer, id16 in claims(layout):
             pointers.setdefault(id16, []).append(pointer)

@@ -333,11 +333,11 @@ class Store:
 
     # Collection
 
-    def garbage(self, grace_seconds: float) -> list[Artefact]:
+    def garbage(self, grace_seconds: float, index: Index | None = None) -> list[Artefact]:
         """Artefacts that gc would remove: see :func:`irlcli.store.collect.garbage`."""
         from irlcli.store.collect import garbage
 
-        return garbage(self._layout, grace_seconds, self.warn)
+        return garbage(self._layout, index or self.index(), grace_seconds, self.warn)
 
     def missing(self, index: Index) -> dict[str, Missing]:
         """Missing artefacts: see :func:`irlcli.store.collect.missing`."""

@@ -231,3 +231,13 @@ def test_evaluations_print_their_returns_as_json(irl, store_copy):
     )
     assert document["id"] == store_copy.evaluation
     assert document["returns"] == reported["rows"] and len(document["returns"]) == 1
+
+
+def test_gc_says_what_an_unused_evaluation_was_made_from(irl, store_copy):
+    store = Store(store_copy.path)
+    assert irl("unname", "*", "--store", store_copy.path).code == 0
+    done = irl("gc", "--grace-days", "0", "--store", store_copy.path)
+    assert done.code == 0, done.err
+    lines = dict(line.split(maxsplit=1) for line in done.out.splitlines())
+    evaluated = [a for a in store.artefacts() if "policy" in a.manifest.record.inputs]
+    assert evaluated and all(" of train-" in lines[a.id] for a in evaluated)
