@@ -6,7 +6,7 @@ from irlcli.configs.load import unseen_settings
 from irlcli.data import descriptions
 from irlcli.experiments.inputs import source_in
 from irlcli.experiments.references import demonstrations
-from irlcli.interventions import check_tabular, parse_setting
+from irlcli.interventions import check_tabular, overlap, parse_setting
 from irlcli.methods import METHODS
 from irlcli.penalties import maxent_methods
 from irlcli.requests import arguments
@@ -127,5 +127,9 @@ def train_maxent(
     arguments.check_weighted(name, maxent_methods(), maxent.penalty, penalty_weight)
     arguments.warn_of_weight(session.console, name, maxent)
     settings = [parse_setting(env, text) for text in texts]
-    unseen = unseen_settings(env, config)
+    unseen = [
+        setting
+        for setting in unseen_settings(env, config)
+        if not any(overlap(setting, trained) for trained in settings)
+    ]
     return maxent_stage.request(source, env, settings, unseen, maxent, seed)

@@ -120,6 +120,7 @@ class OwnKey(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         id, entry_point: how it is made; one of them.
         arguments: that are the same in every setting.
         knobs: the argument of each knob that the settings change, by the knob's name.
+        whole: those of them whose argument is an ``int``, sorted.
         sha256: digest of its code; None for a package installed from an index.
         distribution, version: what its code was installed from; None for a loose file.
     """
@@ -128,6 +129,7 @@ class OwnKey(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     entry_point: str | None = None
     arguments: dict[str, Any] = {}
     knobs: dict[str, str] = {}
+    whole: tuple[str, ...] = ()
     sha256: str | None = None
     distribution: str | None = None
     version: str | None = None
@@ -165,6 +167,7 @@ def environment_key(env: str, settings: Sequence[Setting] | None = None) -> Envi
             entry_point=spec.entry_point or None,
             arguments=spec.own.arguments,
             knobs={name: spec.knobs[name].argument for name in sorted(changed)},
+            whole=tuple(name for name in sorted(changed) if spec.knobs[name].whole),
             sha256=code.sha256,
             distribution=code.distribution,
             version=code.version,

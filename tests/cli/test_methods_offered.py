@@ -82,6 +82,17 @@ def test_maxent_names_what_it_offers(irl, tmp_path):
     assert wrong.code == 2 and "did you mean 'vrex'?" in wrong.err and "bc" not in wrong.err
 
 
+def test_a_setting_that_maxent_trained_in_is_not_measured_as_unseen(irl, tmp_path):
+    path = tmp_path / "runs"
+    # blocked=1 is held out in the settings file.
+    grid = ["--env", "gridworld", "--setting", "blocked=1", "--setting", "path-group=1"]
+    demos = made(irl, path, "collect-experts", *grid, "--episodes", "2")
+    learned = made(irl, path, "train-maxent", "--demos", demos.id)
+    quality = json.loads((learned.directory / "quality.json").read_text())
+    found = [row["setting"] for row in quality["settings"]]
+    assert "blocked=1" in found and len(found) == len(set(found))
+
+
 def test_help_lists_the_methods(irl):
     shown = "".join(irl("train-airl", "--help").out.split())
     assert ",".join(METHODS) in shown

@@ -307,6 +307,17 @@ def test_a_whole_number_reaches_the_constructor_as_an_int(bench):
     assert given == (1, 2) and {type(x) for x in given} == {int}
 
 
+def test_whether_a_knob_takes_whole_numbers_is_in_the_key(bench):
+    """1 // 2 and 1 / 2 differ: an int and a float may make other environments."""
+    bench.edit(bench.toml, 'id = ["0.1", "0.5"]', 'id = ["0", "2"]')
+    one = ("evaluate", "--idle", "--env", "cart.toml", "--profile", "smoke")
+    assert bench.irl(*one, "--intervention", "drag=1").code == 0
+    assert bench.irl(*one, "--intervention", "mass=2x").code == 0
+    bench.edit(bench.toml, 'argument = "drag"', 'argument = "drag"\nwhole = true')
+    assert status(bench, *one, "--intervention", "drag=1") == "RUN"
+    assert status(bench, *one, "--intervention", "mass=2x") == "HIT"
+
+
 def test_seeds_share_a_row_however_many_settings_each_was_evaluated_in(bench):
     common = ("--profile", "smoke", "--quiet")
     both = ("--env", "cart.toml", "--intervention", "mass=1x,2x")
