@@ -150,6 +150,7 @@ class Irregular:
     Attributes:
         cut: cut an episode at the horizon, count one without an end as truncated, and leave an
             empty one out. Otherwise each of them is refused.
+        terminated: episodes that are terminated.
         terminated_at_limit: whole episodes that are terminated in their last possible step.
     """
 
@@ -157,6 +158,7 @@ class Irregular:
     long: int = 0
     unended: int = 0
     empty: int = 0
+    terminated: int = 0
     terminated_at_limit: int = 0
 
     def found_empty(self, place: str) -> None:
@@ -243,6 +245,7 @@ class Check:
         at_limit = (t == self.horizon - 1) & ~ended
         self.irregular.long += int((at_limit & ~last).sum())
         self.irregular.unended += int(unended.sum())
+        self.irregular.terminated += int(steps.terminated.sum())
         self.irregular.terminated_at_limit += int(
             (steps.terminated & (t == self.horizon - 1)).sum()
         )

@@ -220,7 +220,13 @@ def _report(job: Job, irregular: Irregular, written: Written) -> None:
         if count:
             episodes = "episode" if count == 1 else "episodes"
             job.console.warn(f"{count} {episodes} {what}")
-    if irregular.terminated_at_limit:
+    if irregular.terminated and not environment(job.parameters.environment.name).terminates:
+        job.console.warn(
+            f"{irregular.terminated} of {len(written.lengths)} episodes are terminated, but no episode of this "
+            "environment terminates: the absorbing states after their end would tell the expert from "
+            "the policy. Write truncated instead"
+        )
+    elif irregular.terminated_at_limit:
         job.console.warn(
             f"{irregular.terminated_at_limit} of {len(written.lengths)} episodes are terminated in the last "
             "step that the time limit allows: if the time limit ended them, write truncated instead"

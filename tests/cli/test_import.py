@@ -147,6 +147,21 @@ def test_observations_outside_the_environments_bounds_are_counted(
     assert f"7 of {len(table)} steps have observations outside the environment's bounds" in done.err
 
 
+def test_an_end_where_no_episode_ends_is_warned_of(irl, tmp_path):
+    pytest.importorskip("pybullet")
+    columns = {
+        "obs": [[0.0] * 17] * 3,
+        "next_obs": [[0.0] * 17] * 3,
+        "action": [[0.0] * 6] * 3,
+        "terminated": [False, False, True],
+    }
+    pq.write_table(pa.table(columns), tmp_path / "own.parquet")
+    where = ["--env", "half-cheetah", "--setting", "default", "--store", tmp_path / "runs"]
+    done = irl("import", tmp_path / "own.parquet", *where)
+    assert done.code == 0, done.err
+    assert "1 of 1 episodes are terminated, but no episode of this environment" in done.err
+
+
 @pytest.fixture
 def minari(tmp_path, monkeypatch):
     """Minari with an empty directory of datasets."""
