@@ -1,8 +1,9 @@
 """IRM minus ERM in published reports, from their ``seeds.csv``: interval and detectable difference.
 
 For reports that were written before these columns existed. Also the share of each training setting's
-expert that the students earn in the mean over seeds, and the mean over all methods, seed by seed, of
-what retraining earns above the student (t-test). Run with
+expert that the students earn in the mean over seeds, what the training experts earn in each other's
+settings, and the mean over all methods, seed by seed, of what retraining earns above the student
+(t-test). Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
 """
 
@@ -33,6 +34,7 @@ def main(reports: list[Path]) -> None:
                         f"[{low:.1f}, {high:.1f}], detectable {found.detectable:.1f}, p {found.welch:.3f}"
                     )
         _print_imitation(report.name, seeds)
+        _print_reused(report.name, seeds)
         for row, points in learned.groupby("row", sort=False):
             means = points.pivot_table("true_return", "seed", "measure")
             if {"transfer", "zero-shot"} <= {*means}:
@@ -55,6 +57,20 @@ def _print_imitation(name: str, seeds: pd.DataFrame) -> None:
         shares = (earned.droplevel(["row", "agent"]) / means[row, "expert"]).items()
         shown = ", ".join(f"{setting} {share:.1%}" for setting, share in shares)
         print(f"{name}: {row}, {agent}: student's share of the expert: {shown}")
+
+
+def _print_reused(name: str, seeds: pd.DataFrame) -> None:
+    """The baseline as reports have it from stage 35 on; it used to hold each expert's own setting."""
+    inside = seeds[seeds["measure"] == "id"]
+    experts = inside[inside["agent"] == "expert"].groupby("row")["true_return"].mean()
+    # Version 0.1 called them carried over.
+    reused = inside[inside["agent"].isin(["reused", "carried"])]
+    others = reused[reused["expert_of"] != reused["setting"]]
+    for row, earned in others.groupby("row", sort=False)["true_return"].mean().items():
+        share = earned / experts[row]
+        print(
+            f"{name}: {row}, training experts in each other's settings: {earned:.1f} ({share:.1%})"
+        )
 
 
 if __name__ == "__main__":

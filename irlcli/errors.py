@@ -100,7 +100,7 @@ def imported(what: str, place: str) -> Any:
         )
         message = str(error)
         if isinstance(error, SyntaxError):
-            message, hint = f"{error.msg}", f"correct {error.filename}, line {error.lineno}"
+            message, hint = error.msg, f"correct {error.filename}, line {error.lineno}"
         elif (
             isinstance(error, ImportError)
             and error.name

@@ -84,7 +84,7 @@ def _main() -> None:
                 )
             )
         own = _registered()
-        first = f"if it is not the interface of {', '.join(own)}, registered here, " if own else ""
+        first = f"check the interface of {', '.join(own)}; if it is right, " if own else ""
         _fail(
             StageFailed(
                 f"unexpected {described(error)}",

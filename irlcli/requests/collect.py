@@ -63,10 +63,10 @@ def collect_experts(
         env, settings, config, seed, counts, experts, trust, normalisers
     )
     # Other settings' experts may be trained for hours before these files are loaded.
-    for path in (source.path for source in experts.values()):
-        if path.suffix == ".zip" and not zipfile.is_zipfile(path):
+    for source in experts.values():
+        if source.path.suffix == ".zip" and not zipfile.is_zipfile(source.path):
             raise IntegrityError(
-                f"{path} was not saved by stable-baselines3: it is no zip file",
+                f"{source.path} was not saved by stable-baselines3: it is no zip file",
                 "name a file that model.save() wrote",
             )
     return request
