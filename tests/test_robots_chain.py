@@ -89,6 +89,13 @@ def test_walkers_go_through_the_chain(tmp_path, irl, env, intervention, ood):
             assert "half-cheetah mass=2x" in done.err and "different observations" in done.err
             assert "hint: name a setting of goal-y or direction" in done.err
             assert "RUN" not in done.err
+        # An expert with a goal and the cue's hints have observations of one size.
+        line = ["collect-experts", "--env", env, *common[:-1], "--dry-run", "--intervention"]
+        plain = irl(*line, "goal-y=0", "--expert", "goal-y=0=moved")
+        assert plain.code == 0, plain.err
+        for setting in ("mass=2x", "cue-strength=0.8"):
+            done = irl(*line, setting, "--expert", f"{setting}=moved")
+            assert done.code == 2 and "different observations" in done.err
 
 
 def test_a_cloned_student_keeps_the_moments_of_the_demonstrations(chains, irl, tmp_path):

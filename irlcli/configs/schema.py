@@ -379,14 +379,14 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def airl_of(self, settings: Sequence[Setting]) -> AIRLConfig:
         """The config of a reward learned in ``settings``, with the overrides of their only knob."""
-        knobs = {setting.knobs for setting in settings}
-        return self._of("airl", settings[0]) if len(knobs) == 1 else self.airl
+        return self._of("airl", *settings)
 
     def transfer_of(self, setting: Setting) -> TransferConfig:
         """The config of a policy retrained in ``setting``, with the overrides of its only knob."""
         return self._of("transfer", setting)
 
-    def _of(self, section: str, setting: Setting) -> Any:
-        only = self.interventions.get(setting.knobs[0]) if len(setting.knobs) == 1 else None
+    def _of(self, section: str, *settings: Setting) -> Any:
+        knobs = {knob for setting in settings for knob in setting.knobs}
+        only = self.interventions.get(*knobs) if len(knobs) == 1 else None
         own = getattr(only, section, None)
         return getattr(self, section) if own is None else own

@@ -14,6 +14,7 @@ from irlcli.data import descriptions
 from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.inputs import foreign_source, source_in
 from irlcli.experiments.introduce import introduce
+from irlcli.interventions import Setting, check_observed, cue_in, parse_setting, without_cue
 from irlcli.stages.base import Source
 from irlcli.store import Artefact, Store, read_json
 
@@ -78,12 +79,14 @@ def tensor_file(
     return source, descriptions.parse(read_json(path), descriptions.Policy, path)
 
 
-def expert(store: Store, env: str, ref: str) -> Source:
-    """An expert that the user names: a ``.zip`` of stable-baselines3, or a policy here. None is loaded.
+def expert(store: Store, env: str, setting: Setting, ref: str) -> Source:
+    """The expert of ``setting`` that the user names. It is not loaded.
+
+    It is a ``.zip`` of stable-baselines3 or a policy of irl.
 
     Raises:
         NotFound: ``ref`` names nothing.
-        UsageError: not a policy, or one of another environment.
+        UsageError: not a policy, one of another environment, or one of other observations.
         IntegrityError: a damaged policy.
     """
     if ref.endswith(".zip"):
@@ -97,6 +100,9 @@ def expert(store: Store, env: str, ref: str) -> Source:
             f"{ref!r} is a policy of {about.env}, not of {env}",
             "name an expert of this environment",
         )
+    # Experts act without the cue, students that were trained with it take it.
+    takes_cue = any(cue_in(env, parse_setting(env, text)) for text in about.settings)
+    check_observed(env, about.settings, [setting if takes_cue else without_cue(env, setting)])
     return source
 
 

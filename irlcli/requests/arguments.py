@@ -152,7 +152,8 @@ def experts(
     """``--expert SETTING=EXPERT``, repeated: experts, and statistics of ``EXPERT.zip+STATISTICS``.
 
     Raises:
-        UsageError: malformed, a setting with two experts, or a policy of another environment.
+        UsageError: malformed, a setting with two experts, or a policy of another environment or of
+            other observations.
         NotFound: no such file or artefact.
     """
     from irlcli.experiments.references import expert, normaliser
@@ -168,7 +169,7 @@ def experts(
         model, plus, statistics = ref.partition(".zip+")
         if plus:
             ref, normalisers[setting] = f"{model}.zip", normaliser(statistics)
-        found[setting] = expert(store, env, ref)
+        found[setting] = expert(store, env, setting, ref)
     return found, normalisers
 
 

@@ -14,6 +14,7 @@ from irlcli.configs.relevance import relevant_maxent
 from irlcli.interventions import Setting, check_tabular
 from irlcli.stages import collect_experts
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
+from irlcli.stages.running import warn_of_labels
 from irlcli.stages.train_maxent import indexed, judge, read_gridworld, side_by_side
 
 if TYPE_CHECKING:
@@ -143,6 +144,8 @@ def run(job: Job) -> None:
         path = job.inputs[f"demonstrations {seed}"]
         _, episodes = read_gridworld(path, p.environment.name, p.settings)
         demos[seed] = indexed(settings, episodes, p.gridworld)
+        if seed == p.seeds[0]:
+            warn_of_labels(job, [len(group) for group in episodes])
     penalties = list(dict.fromkeys(v.penalty for v in p.variants))
     state = tensors.restore(job.checkpoints.load(), {"rewards", "fit"}, job.checkpoints.discard)
     with tensors.fitting(job.output.parent):

@@ -17,7 +17,7 @@ from irlcli.configs.relevance import relevant_airl, relevant_ppo, relevant_trans
 from irlcli.configs.schema import FromStudentConfig, SACConfig, TransferConfig
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.interventions import parse_settings
+from irlcli.interventions import Setting, parse_settings
 from irlcli.store import canonical_json
 
 LANDER = "lunar-lander"
@@ -480,6 +480,9 @@ def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
     retrained = replace(config.transfer_of(legs).ppo, **constant)
     assert config.airl_of([legs]).challenger.ppo == retrained
     assert config.airl_of([friction]).challenger.ppo == config.transfer_of(friction).ppo
+    # The unchanged world beside it changes no knob; another knob makes it a reward of both.
+    assert config.airl_of([Setting(), legs]) == config.airl_of([legs]) != config.airl
+    assert config.airl_of([legs, friction]) == config.airl
     # Without a reward learning of its own, nothing else differs.
     smoke = load_config("ant", profile="smoke")
     own = smoke.airl_of([legs]).challenger

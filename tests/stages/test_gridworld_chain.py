@@ -147,6 +147,14 @@ def test_shuffled_labels_that_reveal_the_settings_are_named(run, episodes, revea
     assert ("warning: shuffled labels" in done.err) == reveals
 
 
+@pytest.mark.parametrize(("episodes", "reveals"), [("3,3,3", False), ("20,5,2", True)])
+def test_figure_2_names_shuffled_labels_that_reveal_the_settings(run, episodes, reveals):
+    few = ["--set", f"figure2.episodes=[{episodes}]"]
+    done = run("run", "figure2", "--tag", "few", *few)
+    assert done.code == 0, done.err
+    assert done.err.count("shuffled labels still reveal") == reveals
+
+
 def test_methods_learn_different_rewards(run, demos):
     rewards = set()
     for method in METHODS:
