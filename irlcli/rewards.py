@@ -77,7 +77,8 @@ class LearnedReward:
         none = np.empty(0)
         space = ActionSpace(self.discrete, self.action_size, none, none, self.choices)
         kind = np.int64 if self.discrete else np.float32
-        observations = np.ascontiguousarray(obs, dtype=np.float32)
+        # Torch warns of arrays that it must not write to, as pyarrow's are.
+        observations = np.require(obs, np.float32, "CW")
         if observations.ndim != 2:
             raise ValueError(
                 f"obs is {list(observations.shape)}, not [B, {self.observation_size}]: one transition "
@@ -86,9 +87,9 @@ class LearnedReward:
         size = len(observations)
         data = Transitions(
             observations=observations,
-            actions=np.ascontiguousarray(act, dtype=kind),
-            next_observations=np.ascontiguousarray(next_obs, dtype=np.float32),
-            terminated=np.asarray(done, dtype=bool),
+            actions=np.require(act, kind, "CW"),
+            next_observations=np.require(next_obs, np.float32, "CW"),
+            terminated=np.require(done, bool, "CW"),
             remaining=np.zeros(size, dtype=np.int64),
         )
         wanted = {

@@ -98,6 +98,16 @@ def test_it_is_g_by_scale_with_ceiling_and_absorbing_states(tmp_path, env, absor
     assert (reward.env, reward.settings) == (env, (SETTING[env],))
 
 
+@pytest.mark.filterwarnings("error")
+def test_arrays_that_cannot_be_written_to_are_scored_without_a_warning(tmp_path):
+    path, _ = write_random_reward(tmp_path, "half-cheetah")
+    arrays = steps("half-cheetah", 20)
+    expected = irlcli.load_reward(path)(*arrays)
+    for array in arrays:
+        array.flags.writeable = False
+    np.testing.assert_array_equal(irlcli.load_reward(path)(*arrays), expected)
+
+
 @pytest.mark.parametrize("env", SPACES)
 def test_it_is_what_transfer_trains_on(tmp_path, env):
     """The reward of a rollout's steps, absorbing states included."""
