@@ -289,7 +289,7 @@ def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, m
     imported(irl, store_copy, *reversed(parts), *LANDER)
     assert irl("export", "demos", "demos", "--to", "minari:me/all-v0", *store[:2]).code == 0
     assert_answered(irl("import", "minari:me/all-v0", *one, *store), 2, "says engine-power=1.25x")
-    # In a foreign source the word may mean anything but a setting of the import's other sources.
+    # A value of the knob is enough, as text or as a number.
     other = table.drop_columns(["setting"])
     swapped = []
     for text in ("1x", "1.25x"):
@@ -302,9 +302,15 @@ def test_a_source_of_one_setting_names_no_other_one(irl, store_copy, exported, m
     assert_answered(irl("import", *reversed(swapped), *LANDER, *store), 2, said)
     twice = [swapped[0], swapped[0]]
     assert_answered(irl("import", *twice, *LANDER, *store), 2, "two of the sources are the same")
-    foreign = pa.array(["1.25x" if i % 2 else "expert" for i in range(len(other))])
-    pq.write_table(other.append_column("setting", foreign), tmp_path / "foreign.parquet")
-    imported(irl, store_copy, tmp_path / "foreign.parquet", *one)
+    foreign = tmp_path / "foreign.parquet"
+    for said, usual, named in (("1.25x", "expert", one[-1]), (0.5, 0.1, "bounce=0.1")):
+        column = pa.array([said, *[usual] * (len(other) - 1)])
+        pq.write_table(other.append_column("setting", column), foreign)
+        done = irl("import", foreign, *one[:-1], named, *store)
+        assert_answered(done, 2, f"row 0: 'setting' says {said}, but the command names {named}")
+    # The column may mean something else.
+    pq.write_table(other.append_column("setting", pa.array(["novice"] * len(other))), foreign)
+    imported(irl, store_copy, foreign, *one)
 
 
 def test_bad_input_is_one_line_and_a_hint(irl, store_copy, exported, tmp_path):

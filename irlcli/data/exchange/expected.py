@@ -77,26 +77,19 @@ class Expected:
     def contradicts(self, name: Any, place: str) -> None:
         """Refuse a source whose ``setting`` column names another setting than the only one expected.
 
-        ``setting`` may mean anything in a foreign source. So only the whole text of a setting counts,
-        or the value of one that another source of the import is of.
+        The column may mean something else, so what names no setting is accepted.
 
         Raises:
-            UsageError: ``name`` is another setting of the environment.
+            UsageError: ``name`` is another setting of the environment, or another value of the knob.
         """
         (only,) = self.settings
-        wrong = self._meant_by_others(str(name))
-        with suppress(UsageError):
-            wrong = parse_setting(self.env, str(name))
-        if wrong is not None and not same(wrong, parse_setting(self.env, only)):
+        meant = list(self._meant(str(name)))
+        if meant and not any(same(found, parse_setting(self.env, only)) for found in meant):
             raise UsageError(
                 f"{place}: {SETTING!r} says {name}, but the command names {only}",
-                "name the settings that the source holds, or rename that column",
+                "name the settings that the source holds; if the column means something else, "
+                "rename it",
             )
-
-    def _meant_by_others(self, text: str) -> Setting | None:
-        others = [parse_setting(self.env, other) for other in self.others]
-        found = (s for s in self._meant(text) if any(same(s, other) for other in others))
-        return next(found, None)
 
     def shaped(self, actions: np.ndarray) -> np.ndarray:
         """``actions`` [B], [B, K] or [B, A] in the form that the environment's actions have."""

@@ -141,16 +141,13 @@ def _text(name: pa.Scalar) -> str:
     return str(name.as_py() if narrow is None else narrow(name.as_py()))
 
 
-_TEXTS = (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view)
-
-
 def _check_settings(column: pa.Array, expected: Expected, place: Locate) -> None:
-    kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    if any(is_text(kind) for is_text in _TEXTS):
-        names = column.cast(pa.large_string())
-        for name in pc.unique(names).to_pylist():
-            row = pc.index(names, name).as_py() if name is not None else 0
-            expected.contradicts(name, place(row))
+    if pa.types.is_nested(column.type):
+        return
+    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+    for code in pc.unique(coded.indices.drop_null()):
+        row = pc.index(coded.indices, code).as_py()
+        expected.contradicts(_text(coded.dictionary[code.as_py()]), place(row))
 
 
 class _EpisodeStarts:
