@@ -10,7 +10,8 @@ import functools
 import hashlib
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,10 @@ def other_versions(origin: Mapping[str, Any]) -> list[str]:
     return differing({**recorded, "irlcli": libraries()["irlcli"]})
 
 
+# What is followed by a reference; that of `--expert` stands behind its setting.
+_REFERRING = ("--demos", "--reward", "--policy", "--expert", "assess")
+
+
 class _Schema(msgspec.Struct):
     schema: int
 
@@ -160,6 +165,21 @@ def record(command: list[str], workers: int, attempts: tuple[Attempt, ...]) -> d
         "attempts": msgspec.to_builtins(attempts),
         "resumed": len(attempts) - 1,
     }
+
+
+def by_id(command: Sequence[str], resolved: Mapping[str, str]) -> list[str]:
+    """``command`` with ids in place of the references that it reads, because names move.
+
+    Args:
+        resolved: what each reference named.
+    """
+    words = []
+    for before, word in pairwise(["", *command]):
+        option = word.partition("=")[0] if word.startswith("--") else before
+        rest, equals, ref = word.rpartition("=")
+        known = option in _REFERRING and ref in resolved
+        words.append(f"{rest}{equals}{resolved[ref]}" if known else word)
+    return words
 
 
 def _version(library: str) -> str | None:

@@ -216,7 +216,8 @@ class Runner:
                 if isinstance(error, StageFailed):
                     raise StageFailed(f"{request.label}: {error.message}", error.hint) from error
                 raise
-        origin = provenance.record(self.command, self.workers, checkpoints.attempts())
+        command = provenance.by_id(self.command, self.store.resolved)
+        origin = provenance.record(command, self.workers, checkpoints.attempts())
         environment = described(request)
         if environment is not None:
             origin["environment"] = environment

@@ -62,6 +62,8 @@ class Store:
         read_only: bool = False,
     ):
         self.warn = warn
+        #: The references resolved so far, each with the id that it named, and the output.
+        self.resolved: dict[str, str] = {}
         self._index: Index | None = None
         self._layout = Layout(Path(root), read_only)
         layouts.check(self._layout)
@@ -135,7 +137,10 @@ class Store:
 
     def resolve(self, ref: str) -> references.Resolved:
         """What ``ref`` names: see :func:`irlcli.store.references.resolve`."""
-        return references.resolve(self._layout, ref)
+        found = references.resolve(self._layout, ref)
+        if found.artefact is not None:
+            self.resolved[ref] = "/".join(filter(None, (found.artefact.id, found.output)))
+        return found
 
     def names(self) -> dict[str, str]:
         """Name to id, sorted by name."""
@@ -178,7 +183,8 @@ class Store:
             ) from None
         if before is not None:
             undo = shlex.join(["irl", "name", before, name, *self.option])
-            self.warn(f"{name} no longer names {before}; `{undo}` undoes this")
+            exists = (self.root / before).is_dir()
+            self.warn(f"{name} no longer names {before}" + f"; `{undo}` undoes this" * exists)
 
     # Working
 

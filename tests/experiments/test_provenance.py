@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import time
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -223,3 +225,24 @@ def test_code_that_is_not_committed_counts_new_files_too(tmp_path, monkeypatch):
     monkeypatch.setattr(irlcli, "__file__", str(package / "__init__.py"))
     recorded = provenance.Clock().attempt()
     assert (recorded.commit, recorded.dirty) == (clean["commit"], states[-1])
+
+
+def test_a_repair_reads_what_was_read_though_names_moved(irl, store_copy):
+    """The command in the message gives the artefact of the same id."""
+    store, common = Store(store_copy.path), ["--profile", "smoke", "--store", store_copy.path]
+    made = irl("evaluate", "--policy", "moved", "--reward", "airl", "--seed", "7", *common)
+    assert made.code == 0, made.err
+    score = store.resolve(made.out.strip()).artefact
+    idle = irl("evaluate", "--idle", "--env", "lunar-lander", "--ood", "bounce=0.9", *common)
+    for name in ("moved", "airl"):
+        moved = irl("name", Path(idle.out.strip()).name, name, "--store", store_copy.path)
+        assert f"{name} no longer names" in moved.err and "undoes this" in moved.err
+    summary = score.directory / "summary.json"
+    summary.chmod(0o644)
+    summary.write_text("{}")
+    found = irl("verify", score.id, "--store", store_copy.path)
+    assert found.code == 4
+    lines = (found.out + found.err).splitlines()
+    command = next(line[line.index("irl evaluate") :] for line in lines if "irl evaluate" in line)
+    again = irl(*shlex.split(command)[1:])
+    assert (again.code, again.out) == (0, made.out), again.err
