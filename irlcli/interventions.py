@@ -107,7 +107,7 @@ def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) 
     Raises:
         UsageError: a goal or a cue is observed in some of them and not in others.
     """
-    known = environment(env).knobs
+    known, own = environment(env).knobs, environment(env).own is not None
 
     def added(setting: Setting) -> list[str]:
         return sorted({known[knob].observed for knob in setting.knobs} - {""})
@@ -122,9 +122,12 @@ def check_observed(env: str, trained: Sequence[str], wanted: Sequence[Setting]) 
             raise UsageError(
                 f"{env} {setting} and {', '.join(trained)} have different observations: the first "
                 f"are {_observations(added(setting))}, the second {_observations(learned)}",
-                f"name a setting of {', together with '.join(fit)}"
-                if all(fit)
-                else "name the setting default",
+                (
+                    f"name a setting of {', together with '.join(fit)}"
+                    if all(fit)
+                    else "name the setting default"
+                )
+                + "; or omit `observed` of a knob if all settings have what it adds" * own,
             )
 
 

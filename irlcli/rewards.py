@@ -78,7 +78,7 @@ class LearnedReward:
         space = ActionSpace(self.discrete, self.action_size, none, none, self.choices)
         kind = np.int64 if self.discrete else np.float32
         # Torch warns of arrays that it must not write to, as pyarrow's are.
-        observations = np.require(obs, np.float32, "CW")
+        observations = np.require(obs, np.float32, ["C", "W"])
         if observations.ndim != 2:
             raise ValueError(
                 f"obs is {list(observations.shape)}, not [B, {self.observation_size}]: one transition "
@@ -87,9 +87,9 @@ class LearnedReward:
         size = len(observations)
         data = Transitions(
             observations=observations,
-            actions=np.require(act, kind, "CW"),
-            next_observations=np.require(next_obs, np.float32, "CW"),
-            terminated=np.require(done, bool, "CW"),
+            actions=np.require(act, kind, ["C", "W"]),
+            next_observations=np.require(next_obs, np.float32, ["C", "W"]),
+            terminated=np.require(done, bool, ["C", "W"]),
             remaining=np.zeros(size, dtype=np.int64),
         )
         wanted = {

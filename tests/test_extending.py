@@ -112,6 +112,7 @@ def discriminator(samples, options):
         ),
         (PENALTY.format("samples.risks"), "penalty 'wrong' returned [2], not a scalar tensor"),
         (PENALTY.format("1.5"), "penalty 'wrong' returned float, not a scalar tensor"),
+        (PENALTY.format("samples.risks.max() * float('nan')"), "penalty 'wrong' is nan in round 0"),
         (PENALTY.format("samples.risks.detach().max()"), "penalty 'wrong' has no gradient"),
         (PENALTY.replace("):", ")"), "lab.wrong:discriminator cannot be imported (expected ':'"),
         ("def penalty(samples, options): ...", "has no attribute 'discriminator'"),

@@ -4,6 +4,7 @@ A name is that of a built-in environment, of one described by a TOML file, or of
 installed package announces in the entry-point group ``irlcli.environments``.
 """
 
+import os
 from pathlib import Path
 
 from irlcli.envs.ant.spec import SPEC as ANT
@@ -58,7 +59,13 @@ def resolve(ref: str) -> EnvironmentSpec:
         NotFound: there is no such file, or the environment's module cannot be imported.
     """
     if not ref.endswith(".toml"):
-        return environment(ref)
+        try:
+            return environment(ref)
+        except UsageError as error:
+            file = f"{ref}.toml"
+            if os.path.isfile(file):
+                raise UsageError(error.message, f"did you mean the file {file}?") from None
+            raise
     from irlcli.envs.own import read_environment
 
     return introduce(read_environment(Path(ref)))

@@ -23,6 +23,7 @@ the state too often. Only episodes that begin at least one horizon before the ro
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -287,7 +288,7 @@ class AIRL:
         """Take round ``index``'s gradient steps. Returns the cross-entropy and penalty of each.
 
         Raises:
-            StageFailed: the parameters stopped being finite.
+            StageFailed: the penalty is not finite, or the parameters stopped being finite.
         """
         config = self.config
         for parameters in self._optimizer.param_groups:
@@ -311,6 +312,12 @@ class AIRL:
                 self._optimizer.step()
                 losses.append((float(loss.cross_entropy), float(loss.penalty)))
         self.model.eval()
+        bad = next((found for found in losses if not all(map(math.isfinite, found))), None)
+        if bad is not None and math.isfinite(bad[0]):
+            raise StageFailed(
+                f"penalty {config.penalty!r} is {bad[1]} in round {index}",
+                "a smaller airl.learning_rate or airl.penalty_weight usually helps",
+            )
         if not all_finite(self.model):
             raise StageFailed(
                 f"the discriminator's parameters are not finite after round {index}",

@@ -16,7 +16,8 @@ MEASURES = {
     "id": "In distribution: the student, mean over the training settings",
 }
 PROGRESS = (
-    "Progress: what walking or reaching earned, before costs; for MuJoCo's robots, metres forward."
+    "Progress: what walking or reaching earned, before costs; for MuJoCo's robots, metres forward; "
+    "for other environments, what they report."
 )
 # Measures of policies trained on the frozen reward, and measures in the training settings.
 RETRAINED = ("transfer", "from-student", "transfer-id")

@@ -70,22 +70,25 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
 
 
 def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -> list[str]:
-    """Experts that earn no more than the random agent, or less than the training experts.
+    """Experts that earn no more than the random or the idle agent, or less than the training experts.
 
-    Against the former no verdict means anything. A table without a measure in the held-out setting says nothing about its expert.
+    Against the first two no verdict means anything. A table without a measure in the held-out
+    setting says nothing about its expert.
     """
-    weak: dict[tuple[str, str], None] = {}
+    weak: dict[tuple[str, str, str], None] = {}
     for (assessed, _, _), assessment in assessments.items():
-        weak |= dict.fromkeys((assessed, setting) for setting in assessment.weak_settings)
+        weak |= dict.fromkeys((assessed, setting, "random") for setting in assessment.weak_settings)
     means = cells[cells["measure"] == "ood"].set_index(["row", "agent"])["mean"]
     for row in p.rows if has_held_out(p.measures) else ():
-        expert, random = (means.get((row.name, agent)) for agent in ("expert", "random"))
-        if expert is not None and random is not None and expert <= random:
-            weak[row.name, row.unseen] = None
+        expert = means.get((row.name, "expert"))
+        for agent in ("random", "idle"):
+            other = means.get((row.name, agent))
+            if expert is not None and other is not None and expert <= other:
+                weak[row.name, row.unseen, agent] = None
     found = [
-        f"Weak expert: {name}: in {setting} the expert earns no more than the random agent. Shares of "
+        f"Weak expert: {name}: in {setting} the expert earns no more than the {agent} agent. Shares of "
         "the expert and verdicts mean nothing there."
-        for name, setting in weak
+        for name, setting, agent in weak
     ]
     for row in p.rows if has_held_out(p.measures) else ():
         expert, reused = (means.get((row.name, agent)) for agent in ("expert", "reused"))
@@ -158,7 +161,7 @@ def saturated(ends: pd.DataFrame) -> list[str]:
 
 
 def identical(episodes: Episodes) -> list[str]:
-    """Runs that are bitwise equal: seeds that are no sample, or a method without effect.
+    """Runs whose returns are bitwise equal: seeds that are no sample, or a method without effect.
 
     Args:
         episodes: the true returns by (row, measure), then (method, seed); the seed's text also
@@ -170,8 +173,8 @@ def identical(episodes: Episodes) -> list[str]:
             groups.setdefault((row, runs), []).append(measure)
     return [
         f"Identical: {row}, {', '.join(measures)}: "
-        f"{', '.join(f'{title(a)} seed {s}' for a, s in runs)} have bitwise equal returns: neither "
-        "the seed nor the method had an effect."
+        f"{', '.join(f'{title(a)} seed {s}' for a, s in runs)} have bitwise equal returns: what "
+        "they differ in did not change these returns."
         for (row, runs), measures in groups.items()
     ]
 

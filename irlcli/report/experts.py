@@ -20,8 +20,8 @@ from irlcli.report.tables import Table, markdown_table
 _TITLE = "Experts: true return in their own settings"
 _NOTE = (
     f"Mean true return of whole episodes ± standard deviation over episodes. {PROGRESS} A robot that "
-    "stands still is rewarded for being alive. Random and idle agents learn nothing. Time: one "
-    "process on a machine shared with other runs."
+    "stands still is rewarded for being alive. Random and idle agents learn nothing. Time: of one "
+    "process on a machine shared with other runs; its first run includes loading the libraries."
 )
 _USES = {"id": "trained in", "ood": "held out"}
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from irlcli.report.agents import MEASURES, own_measure, title
+from irlcli.report.agents import BASELINES, MEASURES, own_measure, title
 from irlcli.report.parameters import Parameters
 from irlcli.report.statistics import LEVEL
 from irlcli.report.text import number, p_value
@@ -31,7 +31,7 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
         tested = comparisons[(comparisons["row"] == row.name) & (comparisons["measure"] == measure)]
         first = next(tested[tested["difference"].notna()].itertuples(), None)
         methods = p.methods if first is None else (first.y, first.x)
-        others = ("expert", "reused", "random")
+        others = BASELINES
         shown = [means[agent] for agent in (*methods, *others) if agent in means]
         if not any(method in means for method in methods):
             continue
@@ -61,7 +61,7 @@ def _verdict(test: Any) -> str:
         more = "more" if test.difference > 0 else "less"
         claim = f"{x} earns significantly {more} than {y}"
     return (
-        f"{claim}: {test.difference:+.1f} (95 % interval {test.low:.1f} to {test.high:.1f}, "
+        f"{claim}: {test.difference:+z.1f} (95 % interval {test.low:z.1f} to {test.high:z.1f}, "
         f"{_p(test)}). A difference of {test.detectable:.1f} would be found with "
         "a power of 80 %."
     )

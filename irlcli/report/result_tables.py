@@ -178,7 +178,7 @@ def _paper_p(row: paper.PrintedRow, equal_variances: bool) -> float:
 def _cell(cell: Any) -> str:
     if pd.isna(cell.mean):
         return "-"
-    text = f"{cell.mean:.1f}"
+    text = f"{cell.mean:z.1f}"
     if not pd.isna(cell.deviation):
         text += f" ± {cell.deviation:.1f}"
     if cell.seeds < cell.seeds_wanted:
@@ -198,7 +198,7 @@ def by_training_setting(found: pd.DataFrame) -> Table:
             r.setting,
             title(r.agent),
             str(r.seeds),
-            f"{r.mean:.1f}" + ("" if pd.isna(r.deviation) else f" ± {r.deviation:.1f}"),
+            f"{r.mean:z.1f}" + ("" if pd.isna(r.deviation) else f" ± {r.deviation:.1f}"),
             number(r.progress),
             number(r.expert),
             "-" if pd.isna(r.of_expert) else f"{r.of_expert:.0%}",
@@ -300,7 +300,7 @@ def comparisons(p: Parameters, found: pd.DataFrame) -> Table:
                 r.measure,
                 f"{title(r.x)} - {title(r.y)}",
                 number(r.difference),
-                "-" if pd.isna(r.low) else f"[{r.low:.1f}, {r.high:.1f}]",
+                "-" if pd.isna(r.low) else f"[{r.low:z.1f}, {r.high:z.1f}]",
                 number(r.detectable),
                 p_value(r.p_welch),
                 p_value(r.p_welch_holm),
@@ -331,9 +331,9 @@ def discriminators(found: pd.DataFrame) -> Table:
                 f"{r.accuracy:.1%}",
                 number(r.mean_abs_logit),
                 f"{r.cross_entropy:.3f}",
-                f"{r.penalty:.4f}",
+                f"{r.penalty:z.4f}",
                 f"{r.optimised_cross_entropy:.3f}",
-                f"{r.optimised_penalty:.4f}" if penalised else "",
+                f"{r.optimised_penalty:z.4f}" if penalised else "",
                 percent(r.share) if penalised else "",
             ]
         )
@@ -354,7 +354,7 @@ def cells(found: pd.DataFrame) -> Table:
             f"{r.seeds}/{r.seeds_wanted}",
             number(r.mean),
             number(r.deviation),
-            "-" if pd.isna(r.low) else f"[{r.low:.1f}, {r.high:.1f}]",
+            "-" if pd.isna(r.low) else f"[{r.low:z.1f}, {r.high:z.1f}]",
             number(r.iqm),
             number(r.between_retrainings),
             number(r.progress),

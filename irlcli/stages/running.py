@@ -134,7 +134,7 @@ def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
 def shown(true_return: float, progress: float | None) -> str:
     """A true return for the user, with the environment's progress if it reports one."""
     no_progress = progress is None or progress != progress
-    return f"return {true_return:.0f}" + ("" if no_progress else f" progress {progress:.0f}")
+    return f"return {true_return:z.0f}" + ("" if no_progress else f" progress {progress:z.0f}")
 
 
 def summary_of(setting: str, trajectories: "Sequence[Trajectory]") -> dict[str, Any]:

@@ -30,10 +30,12 @@ def test_a_student_that_did_not_imitate():
 
 
 @pytest.mark.parametrize(("expert", "weak"), [(99.0, True), (100.0, True), (101.0, False)])
-def test_an_expert_no_better_than_the_random_agent(expert, weak):
-    returns = complete() | {(BOUNCE, "random", "ood"): [100.0], (BOUNCE, "expert", "ood"): [expert]}
+@pytest.mark.parametrize("agent", ["random", "idle"])
+def test_an_expert_no_better_than_an_agent_that_learns_nothing(agent, expert, weak):
+    returns = complete() | {(BOUNCE, agent, "ood"): [100.0], (BOUNCE, "expert", "ood"): [expert]}
     found = build(*example(returns), {}, {}).caveats
-    assert any(c.startswith(f"Weak expert: {BOUNCE}: in bounce=0.9") for c in found) == weak
+    named = [c for c in found if c.startswith(f"Weak expert: {BOUNCE}: in bounce=0.9")]
+    assert [f"than the {agent} agent" in c for c in named] == [True] * weak
     assert not any(c.startswith(f"Weak expert: {POWER}: ") for c in found)
     # A table of the training settings says nothing about the held-out one.
     p, points = example(returns)

@@ -14,7 +14,7 @@ def test_a_row_has_the_returns_of_its_first_measure():
     line = lines(complete())[BOUNCE]
     assert line.startswith(
         f"{BOUNCE} = 0.9, transfer, true return: AIRL-ERM 2.0; AIRL-IRM 4.0; expert 250.0; "
-        "training experts, reused 110.0; random -200.0."
+        "training experts, reused 110.0; random -200.0; idle -120.0."
     )
 
 
@@ -55,7 +55,7 @@ def test_one_seed_has_returns_and_no_test():
 
 def test_one_method_is_not_compared():
     values = {key: of for key, of in complete().items() if key[1] != "irm"}
-    assert lines(values, methods=("erm",))[BOUNCE].endswith("random -200.0.")
+    assert lines(values, methods=("erm",))[BOUNCE].endswith("random -200.0; idle -120.0.")
 
 
 def test_students_that_did_not_imitate_are_named_and_not_compared():
