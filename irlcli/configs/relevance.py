@@ -133,7 +133,9 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool, terminates: bool = T
     airl = _symmetric(airl)
     airl = _challenger(airl, discrete_actions)
     airl = _replay(airl)
-    return replace(airl, ppo=relevant_ppo(airl.ppo, discrete_actions, "airl.ppo"))
+    ppo = relevant_ppo(airl.ppo, discrete_actions, "airl.ppo")
+    check_rate(ppo, airl.total_steps, "airl.total_steps", "airl.ppo")
+    return replace(airl, ppo=ppo)
 
 
 def _penalty(airl: AIRLConfig) -> AIRLConfig:
@@ -221,6 +223,12 @@ def _challenger(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     # Before what follows from the number of worlds: a minibatch is at most a rollout.
     ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
     ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
+    if ppo.learning_rate_schedule == "linear" and airl.challenger.life * ppo.rollouts_per_round == 1:
+        raise UsageError(
+            "airl.challenger.life = 1 leaves no update: a learning rate that falls to zero needs more "
+            "than one rollout",
+            "--set airl.challenger.life=2 or more",
+        )
     challenger = replace(airl.challenger, ppo=ppo, per_setting=airl.challenger.per_setting or UNSET)
     return replace(airl, challenger=challenger)
 
@@ -273,7 +281,9 @@ def relevant_transfer(
                 "use --algorithm ppo",
             )
         sac = transfer.sac
-        _check_updated(sac, transfer.total_steps)
+        _check_updated(sac, transfer.total_steps, "transfer.total_steps")
+        if transfer.restart_steps is not UNSET:
+            _check_updated(sac, transfer.restart_steps, "transfer.restart_steps")
         if not sac.net_arch:
             sac = replace(sac, activation=_TRANSFER.sac.activation)
         return replace(transfer, ppo=_PPO, sac=sac, from_student=_TRANSFER.from_student)
@@ -289,29 +299,38 @@ def relevant_transfer(
             ),
         )
     ppo = relevant_ppo(transfer.ppo, discrete_actions, "transfer.ppo")
-    _check_rate(ppo, transfer.total_steps, from_student)
+    start = ".from_student" if from_student else ""
+    check_rate(ppo, transfer.total_steps, f"transfer{start}.total_steps", "transfer.ppo")
     return replace(transfer, ppo=ppo, sac=_TRANSFER.sac, from_student=_TRANSFER.from_student)
 
 
-def _check_updated(sac: SACConfig, total_steps: int) -> None:
-    steps = sac.rounds(total_steps) * sac.steps_per_round
+def _check_updated(sac: SACConfig, budget: int, name: str) -> None:
+    steps = sac.rounds(budget) * sac.steps_per_round
     if sac.learning_starts >= steps:
         raise UsageError(
-            f"transfer.sac.learning_starts = {sac.learning_starts} leaves no update: training has "
-            f"{steps} steps",
-            f"--set transfer.sac.learning_starts={steps - 1} or less, or more transfer.total_steps",
+            f"transfer.sac.learning_starts = {sac.learning_starts} leaves no update in {name}, which "
+            f"is {steps} steps",
+            f"--set transfer.sac.learning_starts={steps - 1} or less, or more {name}",
         )
 
 
-def _check_rate(ppo: PPOConfig, total_steps: int, from_student: bool) -> None:
-    """Refuse a single rollout at a linear rate: after it, the rate is zero and nothing is learned."""
+def check_rate(ppo: PPOConfig, total_steps: int, budget: str, section: str) -> None:
+    """Refuse a single rollout at a linear rate: after it, the rate is zero and nothing is learned.
+
+    Args:
+        ppo: how the policy learns.
+        total_steps: for how many steps.
+        budget, section: the fields that hold the two.
+
+    Raises:
+        UsageError: ``total_steps`` are at most one rollout.
+    """
     rollout = ppo.n_envs * ppo.n_steps
     if ppo.learning_rate_schedule == "linear" and total_steps <= rollout:
-        budget = "transfer.from_student.total_steps" if from_student else "transfer.total_steps"
         raise UsageError(
             f"{budget} = {total_steps} leaves no update: a learning rate that falls to zero needs more "
             f"than one rollout, here of {rollout} steps",
-            f"--set {budget}={2 * rollout} or more, or fewer transfer.ppo.n_steps",
+            f"--set {budget}={2 * rollout} or more, or fewer {section}.n_steps",
         )
 
 

@@ -199,7 +199,8 @@ class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Policies trained from random weights on the current reward, as later on the frozen one.
 
     A challenger is trained on the current g, in the settings trained on. Its episodes are
-    negatives, so the reward corrects the states that a new policy goes through.
+    negatives, so the reward corrects the states that a new policy goes through. This g is not yet
+    divided by its deviation, as the frozen one is, so ``ppo.normalise_rewards`` should be true.
 
     Attributes:
         life: rounds after which the next challenger starts from random weights; 0 for none. The last
@@ -245,6 +246,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         gradient_penalty: weight of the mean squared gradient of g by its input, between the
             policy's samples and the expert's. It keeps g from saturating.
         weight_decay: decoupled (AdamW), so that its strength does not depend on lambda.
+        batch_size: demonstrated samples of the discriminator's minibatch, per setting; as many are the
+            policy's.
         replay_share: share of the discriminator's policy samples that come from past rounds;
             each round adds ``replay_episodes_per_round`` episodes a setting, of which
             ``replay_capacity`` are kept.

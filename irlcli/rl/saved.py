@@ -72,6 +72,9 @@ class SavedPolicy(Policy):
             # SB3's predict clips the samples. Demonstrations hold them as they were drawn.
             actions = super().act(shaped, deterministic)
         else:
+            if isinstance(self._model, SAC) and self._model.use_sde:
+                # SB3's predict keeps the noise that was drawn when the model was loaded.
+                self._model.actor.reset_noise(len(shaped))
             actions, _ = self._model.predict(shaped, deterministic=deterministic or self._greedy)
         return actions if actions.ndim == 1 else actions.reshape(len(actions), -1)
 
@@ -97,7 +100,7 @@ def load_saved(
     Raises:
         IntegrityError: not a file that SB3's PPO, SAC, TD3 or DQN wrote, or not readable here.
         UsageError: the expert has other observations or actions than the setting, or is a PPO that
-            was trained under VecNormalize and there are no statistics.
+            squashes its actions or was trained under VecNormalize without statistics here.
     """
     name, data = saved
     with closing(make(env, setting)) as world:
@@ -133,6 +136,11 @@ def load_saved(
                 f"{name} has {what} in {own}, but {env} {setting} in {theirs}",
                 "name an expert that was trained in this environment",
             )
+    if isinstance(model.policy, ActorCriticPolicy) and model.policy.squash_output:
+        raise UsageError(
+            f"{name} squashes its actions (squash_output), which is read of SAC only",
+            "train the expert without squash_output",
+        )
     model.policy.set_training_mode(False)
     normaliser = None if statistics is None else _normaliser(statistics, spaces[0])
     return SavedPolicy(model, normaliser)

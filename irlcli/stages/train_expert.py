@@ -5,7 +5,7 @@ from contextlib import closing
 import msgspec
 
 from irlcli.configs import Config, ExpertConfig, PPOConfig
-from irlcli.configs.relevance import relevant_ppo
+from irlcli.configs.relevance import check_rate, relevant_ppo
 from irlcli.envs.registry import environment
 from irlcli.interventions import Setting, check_tabular, parse_setting, without_cue
 from irlcli.stages.base import EnvironmentKey, Job, Request, Stage, environment_key
@@ -26,7 +26,8 @@ def request(env: str, setting: Setting, seed: int, expert: ExpertConfig) -> Requ
     """The expert of ``setting``: outputs ``policy.pt``, ``policy.json``, ``metrics.parquet``.
 
     Raises:
-        UsageError: a tabular environment, or an option that needs continuous actions.
+        UsageError: a tabular environment, an option that needs continuous actions, or a budget
+            that leaves no update.
     """
     check_tabular(env, "train-expert", wanted=False)
     parameters = Parameters(
@@ -36,6 +37,7 @@ def request(env: str, setting: Setting, seed: int, expert: ExpertConfig) -> Requ
         total_steps=expert.total_steps,
         ppo=relevant_ppo(expert.ppo, environment(env).discrete_actions, "expert.ppo"),
     )
+    check_rate(expert.ppo, expert.total_steps, "expert.total_steps", "expert.ppo")
     return Request(STAGE, parameters, {}, f"train-expert {env} {setting} seed {seed}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from msgspec.structs import replace
 
 from irlcli.configs import PROFILES, Config, PPOConfig, load_config
 from irlcli.configs.relevance import relevant_airl, relevant_ppo, relevant_transfer
-from irlcli.configs.schema import FromStudentConfig, SACConfig, TransferConfig
+from irlcli.configs.schema import AIRLConfig, ChallengerConfig, FromStudentConfig, SACConfig, TransferConfig
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, parse_settings
@@ -572,8 +573,11 @@ def test_a_training_without_an_update_is_refused():
     sac = TransferConfig(algorithm="sac", total_steps=1000, sac=SACConfig(n_envs=2, n_steps=100))
     begins = [replace(sac.sac, learning_starts=n) for n in (999, 1000)]
     assert relevant(replace(sac, sac=begins[0])).sac == begins[0]
-    with pytest.raises(UsageError, match="leaves no update: training has 1000 steps"):
+    with pytest.raises(UsageError, match=r"leaves no update in transfer\.total_steps, which is 1000"):
         relevant(replace(sac, sac=begins[1]))
+    early = replace(sac, restarts=2, restart_steps=200, sac=begins[0])
+    with pytest.raises(UsageError, match=r"leaves no update in transfer\.restart_steps"):
+        relevant(early)
     with pytest.raises(UsageError, match=r"transfer\.ppo: one world and one step"):
         relevant(TransferConfig(ppo=PPOConfig(n_envs=1, n_steps=1)))
     falling = PPOConfig(n_envs=2, n_steps=100, learning_rate_schedule="linear")
@@ -585,6 +589,18 @@ def test_a_training_without_an_update_is_refused():
     student = replace(rounds, from_student=FromStudentConfig(total_steps=200))
     with pytest.raises(UsageError, match=r"transfer\.from_student\.total_steps = 200 leaves no"):
         relevant(student, from_student=True)
+    with pytest.raises(UsageError, match=r"airl\.total_steps = 200 leaves no update"):
+        relevant_airl(AIRLConfig(total_steps=200, ppo=falling), discrete_actions=False)
+    # Of a challenger, whose budget is its life.
+    for life, rollouts in ((1, 1), (2, 1), (1, 2)):
+        ppo = replace(falling, rollouts_per_round=rollouts)
+        airl = AIRLConfig(logit="f", policy_reward="f", challenger=ChallengerConfig(life=life, ppo=ppo))
+        with (
+            pytest.raises(UsageError, match=r"airl\.challenger\.life = 1 leaves no update")
+            if life * rollouts == 1
+            else nullcontext()
+        ):
+            relevant_airl(airl, discrete_actions=False)
 
 
 def test_a_knobs_own_retraining_wins_over_the_general_one_and_flags_over_both():

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from irlcli.data.demonstrations import read_demonstrations
+from irlcli.envs.registry import resolve
+from irlcli.interventions import Setting
+from irlcli.rl.saved import File, load_saved
 from irlcli.store import Store, file_digest
 
 COLLECT = ("collect-experts", "--env", "cart.toml", "--profile", "smoke", "--quiet")
@@ -68,12 +73,41 @@ def test_samples_are_reproducible_and_another_file_is_another_key(bench):
     assert actions.std() > 0.5 and abs(actions).max() > 1.0
     again, _ = demonstrations(bench.irl, *COLLECT, *given, "--store", "runs")
     assert again.id == first.id
-    import shutil
-
     shutil.rmtree("runs")
     assert demonstrations(bench.irl, *COLLECT, *given)[0].id == first.id
     trained("PPO", cart(), "expert.zip", n_steps=16, batch_size=16)
     assert demonstrations(bench.irl, *COLLECT, *given)[0].id != first.id
+
+
+def test_the_noise_of_a_sac_with_gsde_is_drawn_for_every_step(bench):
+    """Not once when the model is loaded, from whatever ran before in this process."""
+    trained("SAC", cart(), "expert.zip", use_sde=True)
+    given = ("--intervention", "mass=1x", "--expert", "mass=1x=expert.zip", "--trust")
+    found = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        found.append(demonstrations(bench.irl, *COLLECT, *given, "--store", "runs")[1]["mass=1x"])
+        shutil.rmtree("runs")
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one.actions, other.actions)
+    saved = File("expert.zip", Path("expert.zip").read_bytes())
+    policy = load_saved(saved, resolve("cart.toml").name, Setting())
+    seen = np.repeat(found[0][0].observations[:1], 3, axis=0)
+    drawn = np.concatenate([policy.act(seen), policy.act(seen)])
+    assert len(np.unique(drawn)) == len(drawn)
+
+
+def test_a_ppo_that_squashes_its_actions_is_refused(bench):
+    options = {"net_arch": [8], "squash_output": True}
+    import stable_baselines3
+
+    model = stable_baselines3.PPO(
+        "MlpPolicy", cart(), n_steps=16, batch_size=16, use_sde=True, policy_kwargs=options
+    )
+    model.save("expert.zip")
+    given = ("--intervention", "mass=1x", "--expert", "mass=1x=expert.zip", "--trust")
+    refused = bench.irl(*COLLECT, *given)
+    assert refused.code == 2 and "squash_output" in refused.err
 
 
 def test_a_model_trained_under_vecnormalize_needs_its_statistics(bench):
