@@ -223,7 +223,10 @@ def _challenger(airl: AIRLConfig, discrete_actions: bool) -> AIRLConfig:
     # Before what follows from the number of worlds: a minibatch is at most a rollout.
     ppo = replace(airl.challenger.ppo, n_envs=airl.ppo.n_envs)
     ppo = relevant_ppo(ppo, discrete_actions, "airl.challenger.ppo")
-    if ppo.learning_rate_schedule == "linear" and airl.challenger.life * ppo.rollouts_per_round == 1:
+    if (
+        ppo.learning_rate_schedule == "linear"
+        and airl.challenger.life * ppo.rollouts_per_round == 1
+    ):
         raise UsageError(
             "airl.challenger.life = 1 leaves no update: a learning rate that falls to zero needs more "
             "than one rollout",

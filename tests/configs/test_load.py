@@ -15,7 +15,13 @@ from msgspec.structs import replace
 
 from irlcli.configs import PROFILES, Config, PPOConfig, load_config
 from irlcli.configs.relevance import relevant_airl, relevant_ppo, relevant_transfer
-from irlcli.configs.schema import AIRLConfig, ChallengerConfig, FromStudentConfig, SACConfig, TransferConfig
+from irlcli.configs.schema import (
+    AIRLConfig,
+    ChallengerConfig,
+    FromStudentConfig,
+    SACConfig,
+    TransferConfig,
+)
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, parse_settings
@@ -573,7 +579,9 @@ def test_a_training_without_an_update_is_refused():
     sac = TransferConfig(algorithm="sac", total_steps=1000, sac=SACConfig(n_envs=2, n_steps=100))
     begins = [replace(sac.sac, learning_starts=n) for n in (999, 1000)]
     assert relevant(replace(sac, sac=begins[0])).sac == begins[0]
-    with pytest.raises(UsageError, match=r"leaves no update in transfer\.total_steps, which is 1000"):
+    with pytest.raises(
+        UsageError, match=r"leaves no update in transfer\.total_steps, which is 1000"
+    ):
         relevant(replace(sac, sac=begins[1]))
     early = replace(sac, restarts=2, restart_steps=200, sac=begins[0])
     with pytest.raises(UsageError, match=r"leaves no update in transfer\.restart_steps"):
@@ -594,7 +602,9 @@ def test_a_training_without_an_update_is_refused():
     # Of a challenger, whose budget is its life.
     for life, rollouts in ((1, 1), (2, 1), (1, 2)):
         ppo = replace(falling, rollouts_per_round=rollouts)
-        airl = AIRLConfig(logit="f", policy_reward="f", challenger=ChallengerConfig(life=life, ppo=ppo))
+        airl = AIRLConfig(
+            logit="f", policy_reward="f", challenger=ChallengerConfig(life=life, ppo=ppo)
+        )
         with (
             pytest.raises(UsageError, match=r"airl\.challenger\.life = 1 leaves no update")
             if life * rollouts == 1
