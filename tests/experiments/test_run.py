@@ -320,7 +320,7 @@ def test_lambda_is_chosen_before_the_reward_is_learned(irl, tmp_path, smoke_stor
     """The reward's key is known only when the choice was made: its step still runs once."""
     tables = tmp_path / "tables.toml"
     tables.write_text(TABLES.replace('["erm", "irm"]', '["irm"]'))
-    small = ["--set", "airl.total_steps=1024", "--set", "evaluation.episodes=1"]
+    small = ["--set", "airl.total_steps=1536", "--set", "evaluation.episodes=1"]
     words = ["tiny", "--experiments", tables, "--profile", "smoke", *small, "--tag", "chosen"]
     words += ["--choose-penalty", "1,10", "--store", tmp_path / "runs"]
     name = "chosen.lunar-lander.engine-power.irm.0"

@@ -313,7 +313,7 @@ def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path
     copy = tmp_path / "runs"
     shutil.copytree(table_store, copy, symlinks=True)
     before = Path(report("table1", copy, *ROW).out.strip())
-    other = [w.replace("airl.total_steps=2048", "airl.total_steps=1024") for w in SMALL]
+    other = [w.replace("airl.total_steps=2048", "airl.total_steps=1536") for w in SMALL]
     more = ["--store", copy, "--profile", "smoke", "--quiet", *other]
     made = irl("train-airl", "--demos", "demos", "--method", "irm", "--seed", "0", *more)
     assert made.code == 0, made.err
@@ -321,7 +321,7 @@ def test_other_budgets_are_left_out_and_named(report, irl, table_store, tmp_path
     (left_out,) = (n for n in caveats(done) if n.startswith("Left out"))
     assert "1 run of train-airl, lunar-lander engine-power=1x engine-power=1.25x irm" in left_out
     assert f"({Path(made.out.strip()).name})" in left_out
-    assert left_out.endswith("airl.total_steps 1024 instead of 2048.")
+    assert left_out.endswith("airl.total_steps 1536 instead of 2048.")
     after = Path(done.out.strip())
     assert (after / "table1.csv").read_bytes() == (before / "table1.csv").read_bytes()
 
