@@ -167,7 +167,8 @@ def _own(spec: EnvironmentSpec, own: Own, arguments: dict[str, Any], where: str)
         raise
     except (gymnasium.error.UnregisteredEnv, gymnasium.error.DeprecatedEnv) as error:
         raise UsageError(
-            f"{own.source}: env.id: {first_line(error)[:300]}", "is the id registered?"
+            f"{own.source}: env.id: {first_line(error)[:300]}",
+            "name a registered id, with its version as in Hopper-v5",
         ) from error
     except (Exception, SystemExit) as error:
         if "render_mode" in arguments and "render_mode" in str(error):
