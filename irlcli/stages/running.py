@@ -4,7 +4,7 @@ Stages import this module when they are planned, so that heavy libraries are imp
 functions only.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import isnan, nan
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +129,25 @@ def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
             "shuffled labels still reveal the settings, so this is not a valid control: one setting "
             f"has too few demonstrations ({min(counts)}) for {len(counts)} groups"
         )
+
+
+def warn_of_failures(job: Job, settings: Mapping[str, "Sequence[Trajectory]"]) -> None:
+    """Warn of demonstrations that end early and earn less than those of the setting that do not.
+
+    What follows such an end is then the expert's, too, and a reward may come to pay for it.
+    """
+    import numpy as np
+
+    for text, episodes in settings.items():
+        early, others = (
+            [t.episode_return for t in episodes if t.terminated == ended] for ended in (True, False)
+        )
+        if early and others and np.mean(early) < np.mean(others):
+            job.console.warn(
+                f"{len(early)} of {len(episodes)} demonstrations in {text} end early and earn less than "
+                "the others: a reward of absorbing states may pay for such ends; experts that "
+                "fail by chance fail less with --set demonstrations.deterministic=true"
+            )
 
 
 def shown(true_return: float, progress: float | None) -> str:

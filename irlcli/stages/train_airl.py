@@ -19,7 +19,7 @@ from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
-from irlcli.stages.running import run_training, warn_of_labels
+from irlcli.stages.running import run_training, warn_of_failures, warn_of_labels
 
 if TYPE_CHECKING:
     from irlcli.learners.airl import AIRL
@@ -284,6 +284,8 @@ def _episodes(
         except ValueError as error:
             raise UsageError(str(error), "select by a setting, or record more episodes") from None
         episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
+    if p.airl.fixed_horizon:
+        warn_of_failures(job, dict(zip(settings, episodes, strict=True)))
     if p.airl.grouping == "shuffled":
         warn_of_labels(job, [len(group) for group in episodes])
     return episodes, held_out

@@ -405,6 +405,30 @@ def test_a_knob_that_extends_the_observation_must_say_so(bench):
     assert again.code == 0, again.out
 
 
+@pytest.mark.parametrize(("reward", "warned"), [(-100.0, True), (100.0, False)])
+def test_demonstrations_that_fail_are_warned_of(bench, reward, warned):
+    """One of them ends after five steps; whether that is a failure, its return says."""
+    assert bench.irl(*COLLECT, *ONE, "--name", "demos").code == 0
+    assert bench.irl("export", "demos", "demos", "--to", "parquet:own.parquet").code == 0
+    table = pq.read_table("own.parquet")
+    length = int(np.argmax(np.asarray(table["truncated"]) | np.asarray(table["terminated"]))) + 1
+    ended = {
+        "terminated": [False] * 4 + [True],
+        "truncated": [False] * 5,
+        "reward": [reward] * 5,
+    }
+    first = table.slice(0, 5)
+    for name, values in ended.items():
+        place = first.schema.get_field_index(name)
+        first = first.set_column(place, first.schema.field(name), pa.array(values))
+    pq.write_table(pa.concat_tables([first, table.slice(length)]), "other.parquet")
+    done = bench.irl("import", "other.parquet", "--env", "cart.toml", *ONE, "--name", "own")
+    assert done.code == 0, done.err
+    done = bench.irl("train-airl", "--demos", "own", "--method", "erm", "--profile", "smoke")
+    assert done.code == 0, done.err
+    assert ("demonstrations in mass=2x end early and earn less" in done.err) == warned
+
+
 def test_actions_in_other_units_and_a_time_limit_written_as_an_end_are_warned_of(bench):
     made = bench.irl(*COLLECT, *ONE, "--name", "demos")
     assert made.code == 0, made.err
