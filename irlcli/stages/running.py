@@ -131,10 +131,13 @@ def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
         )
 
 
-def warn_of_failures(job: Job, settings: Mapping[str, "Sequence[Trajectory]"]) -> None:
+def warn_of_failures(
+    job: Job, settings: Mapping[str, "Sequence[Trajectory]"], sampled: bool
+) -> None:
     """Warn of demonstrations that end early and earn less than those of the setting that do not.
 
     What follows such an end is then the expert's, too, and a reward may come to pay for it.
+    ``sampled``: whether the demonstrations are known to be samples of a stochastic expert.
     """
     import numpy as np
 
@@ -145,8 +148,8 @@ def warn_of_failures(job: Job, settings: Mapping[str, "Sequence[Trajectory]"]) -
         if early and others and np.mean(early) < np.mean(others):
             job.console.warn(
                 f"{len(early)} of {len(episodes)} demonstrations in {text} end early and earn less than "
-                "the others: a reward of absorbing states may pay for such ends; experts that "
-                "fail by chance fail less with --set demonstrations.deterministic=true"
+                "the others: a reward of absorbing states may pay for such ends"
+                + ("; collect them with --set demonstrations.deterministic=true" if sampled else "")
             )
 
 

@@ -29,6 +29,8 @@ SPACES = "gymnasium.spaces."
 OBSERVATIONS = "gymnasium.spaces.Box(-10.0, 10.0, (2,), np.float32)"
 ACTIONS = "gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)"
 RETURNED = "return np.clip([self.position, self.speed], -10.0, 10.0).astype(np.float32)"
+DERAILED = """derailed = self.np_random.uniform() < 0.02
+        reward = -100.0 if derailed else 1.0"""
 FORCE = "float(np.clip(action, -1.0, 1.0)[0])"
 
 
@@ -427,6 +429,22 @@ def test_demonstrations_that_fail_are_warned_of(bench, reward, warned):
     done = bench.irl("train-airl", "--demos", "own", "--method", "erm", "--profile", "smoke")
     assert done.code == 0, done.err
     assert ("demonstrations in mass=2x end early and earn less" in done.err) == warned
+    # Nobody knows whether imported actions were sampled.
+    assert "demonstrations.deterministic" not in done.err
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_only_sampled_demonstrations_are_advised_to_be_deterministic(bench, sampled):
+    """A cart that derails by chance, which costs it all that it earned."""
+    bench.edit(bench.module, "reward = 1.0 - abs(self.position)", DERAILED)
+    bench.edit(bench.module, "abs(self.position) > 5.0", "derailed")
+    demos = ("--set", "demonstrations.episodes=8", "--name", "demos")
+    choice = () if sampled else ("--set", "demonstrations.deterministic=true")
+    done = bench.irl(*COLLECT, *ONE, *demos, *choice)
+    assert done.code == 0, done.err
+    done = bench.irl("train-airl", "--demos", "demos", "--method", "erm", "--profile", "smoke")
+    assert done.code == 0 and "of 8 demonstrations in mass=2x end early" in done.err, done.err
+    assert ("--set demonstrations.deterministic=true" in done.err) == sampled
 
 
 def test_actions_in_other_units_and_a_time_limit_written_as_an_end_are_warned_of(bench):
