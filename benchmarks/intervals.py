@@ -15,6 +15,7 @@ from pathlib import Path
 import pandas as pd
 
 from irlcli.methods import METHODS
+from irlcli.report.parameters import EXPERT_BY_REWARD
 from irlcli.report.statistics import compare, paired_p
 
 
@@ -22,7 +23,7 @@ def main(reports: list[Path]) -> None:
     """Print a line for each row and measure, and one for retraining."""
     for report in reports:
         seeds = pd.read_csv(report / "seeds.csv")
-        learned = seeds[seeds["agent"].isin([*METHODS])]
+        learned = seeds[seeds["agent"].isin([*METHODS]) & (seeds["measure"] != EXPERT_BY_REWARD)]
         for (row, measure), points in learned.groupby(["row", "measure"], sort=False):
             by_seed = points.groupby(["agent", "seed"])["true_return"].mean()
             if {"irm", "erm"} <= {*by_seed.index.get_level_values("agent")}:
@@ -36,9 +37,9 @@ def main(reports: list[Path]) -> None:
         _print_imitation(report.name, seeds)
         _print_reused(report.name, seeds)
         for row, points in learned.groupby("row", sort=False):
-            means = points.pivot_table("true_return", "seed", "measure")
+            means = points.pivot_table("true_return", ["agent", "seed"], "measure")
             if {"transfer", "zero-shot"} <= {*means}:
-                both = means[["transfer", "zero-shot"]].dropna()
+                both = means[["transfer", "zero-shot"]].dropna().groupby("seed").mean()
                 p = paired_p(both["transfer"].tolist(), both["zero-shot"].tolist())
                 gain = (both["transfer"] - both["zero-shot"]).mean()
                 shown = "-" if p is None else f"{p:.3f}"
@@ -62,14 +63,16 @@ def _print_imitation(name: str, seeds: pd.DataFrame) -> None:
 def _print_reused(name: str, seeds: pd.DataFrame) -> None:
     """The baseline as reports have it from stage 35 on; it used to hold each expert's own setting."""
     inside = seeds[seeds["measure"] == "id"]
-    experts = inside[inside["agent"] == "expert"].groupby("row")["true_return"].mean()
+    experts = inside[inside["agent"] == "expert"].set_index(["row", "setting"])["true_return"]
     # Version 0.1 called them carried over.
     reused = inside[inside["agent"].isin(["reused", "carried"])]
     others = reused[reused["expert_of"] != reused["setting"]]
-    for row, earned in others.groupby("row", sort=False)["true_return"].mean().items():
-        share = earned / experts[row]
+    for row, of in others.groupby("row", sort=False):
+        earned = of.groupby("setting")["true_return"].mean()
+        share = (earned / experts[row]).mean()
         print(
-            f"{name}: {row}, training experts in each other's settings: {earned:.1f} ({share:.1%})"
+            f"{name}: {row}, training experts in each other's settings: {earned.mean():.1f} "
+            f"({share:.1%})"
         )
 
 

@@ -91,10 +91,9 @@ def print_assessment(assessment: Assessment) -> None:
     out.print_table(columns, [_ranked(s) for s in every], stderr=True)
     if assessment.epic_missing:
         out.print_note(f"no EPIC distance: {assessment.epic_missing}")
-    for setting in assessment.weak_settings:
-        out.print_note(
-            f"{setting}: the expert earns no more than the random agent, so there is no verdict"
-        )
+    for setting, agent in assessment.weak_experts:
+        consequence = ", so there is no verdict" if agent == "random" else ""
+        out.print_note(f"{setting}: the expert earns no more than the {agent} agent{consequence}")
     splits: list[list[Any]] = [
         [
             s.setting,

@@ -306,9 +306,19 @@ class Assessment(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"the bank has no expert or no random agent in {s.setting}")
 
     @property
-    def weak_settings(self) -> list[str]:
-        """Settings without verdicts, because the expert earns no more than the random agent."""
-        return [s.setting for s in self.settings if any(r.verdict is None for r in s.retrained)]
+    def weak_experts(self) -> list[tuple[str, str]]:
+        """The settings whose expert earns no more than the random or the idle agent, and that agent.
+
+        Beside the random one no verdict is given.
+        """
+        earned = {(e.setting, e.kind): e.true.mean for e in self.bank}
+        return [
+            (s.setting, agent)
+            for s in self.settings
+            for agent in ("random", "idle")
+            if {(s.setting, agent), (s.setting, "expert")} <= set(earned)
+            and earned[s.setting, "expert"] <= earned[s.setting, agent]
+        ]
 
 
 class HintContrast(Struct, frozen=True, kw_only=True):

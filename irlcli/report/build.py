@@ -102,7 +102,7 @@ def build(
     ]
     found = [
         *caveats.missing(p),
-        *caveats.weak_experts(p, cells, assessments),
+        *caveats.weak_experts(p, points, cells, assessments),
         *caveats.below_bar(p, points),
         *caveats.not_imitated(cells),
         *caveats.short_of_expert(learned_returns),

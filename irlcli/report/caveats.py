@@ -8,10 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from irlcli.report.agents import title
+from irlcli.methods import METHODS
+from irlcli.report.agents import IN_DISTRIBUTION, title
 from irlcli.report.compute import IMITATED, Assessments, failed_to_imitate
 from irlcli.report.lineage import evaluations, is_mixed, lineage, origins, short
-from irlcli.report.parameters import Cell, Code, Parameters, has_held_out
+from irlcli.report.parameters import EXPERT_BY_REWARD, Cell, Code, Parameters, has_held_out
 from irlcli.report.statistics import identical_runs
 from irlcli.report.text import percent
 
@@ -69,15 +70,16 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
     return found
 
 
-def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -> list[str]:
-    """Experts that earn no more than the random or the idle agent, or less than the training experts.
+def weak_experts(
+    p: Parameters, points: pd.DataFrame, cells: pd.DataFrame, assessments: Assessments
+) -> list[str]:
+    """Experts that earn no more than the random or the idle agent, or less than another policy.
 
-    Against the first two no verdict means anything. A table without a measure in the held-out
-    setting says nothing about its expert.
+    A table without a measure in the held-out setting says nothing about its expert.
     """
     weak: dict[tuple[str, str, str], None] = {}
     for (assessed, _, _), assessment in assessments.items():
-        weak |= dict.fromkeys((assessed, setting, "random") for setting in assessment.weak_settings)
+        weak |= dict.fromkeys((assessed, *found) for found in assessment.weak_experts)
     means = cells[cells["measure"] == "ood"].set_index(["row", "agent"])["mean"]
     for row in p.rows if has_held_out(p.measures) else ():
         expert = means.get((row.name, "expert"))
@@ -87,17 +89,32 @@ def weak_experts(p: Parameters, cells: pd.DataFrame, assessments: Assessments) -
                 weak[row.name, row.unseen, agent] = None
     found = [
         f"Weak expert: {name}: in {setting} the expert earns no more than the {agent} agent. Shares of "
-        "the expert and verdicts mean nothing there."
+        f"the expert {'and verdicts mean nothing' if agent == 'random' else 'mean little'} there."
         for name, setting, agent in weak
     ]
     for row in p.rows if has_held_out(p.measures) else ():
-        expert, reused = (means.get((row.name, agent)) for agent in ("expert", "reused"))
-        if expert is not None and reused is not None and reused > expert:
+        expert = means.get((row.name, "expert"))
+        others = _earned_in(row.unseen, points[points["row"] == row.name])
+        if expert is not None and len(others) and others.max() > expert:
             found.append(
-                f"Weak expert: {row.name}: the training experts earn {reused:.1f} in {row.unseen}, that "
-                f"setting's own expert {expert:.1f}, so a better policy than this expert is known."
+                f"Weak expert: {row.name}: in {row.unseen} {others.idxmax()} earn {others.max():.1f}, "
+                f"that setting's own expert {expert:.1f}. It may not be the best policy known."
             )
     return found
+
+
+def _earned_in(setting: str, points: pd.DataFrame) -> pd.Series:
+    """The mean true returns in ``setting`` of each method's policies, and of the best training expert."""
+    of = points[(points["setting"] == setting) & points["true_return"].notna()]
+    of = of[~of["measure"].isin([EXPERT_BY_REWARD, *IN_DISTRIBUTION])]
+    reused, learned = of[of["agent"] == "reused"], of[of["agent"].isin([*METHODS])]
+    earned = {
+        f"{title(agent)}'s {measure} policies": group["true_return"].mean()
+        for (agent, measure), group in learned.groupby(["agent", "measure"], sort=False)
+    }
+    if len(reused):
+        earned["policies of the best training expert"] = reused["true_return"].max()
+    return pd.Series(earned, dtype=float)
 
 
 def below_bar(p: Parameters, points: pd.DataFrame) -> list[str]:

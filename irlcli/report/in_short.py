@@ -9,7 +9,7 @@ import pandas as pd
 from irlcli.report.agents import BASELINES, MEASURES, own_measure, title
 from irlcli.report.parameters import Parameters
 from irlcli.report.statistics import LEVEL
-from irlcli.report.text import number, p_value
+from irlcli.report.text import incomplete, number, p_value
 
 
 def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
@@ -24,7 +24,7 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
     for row in p.rows:
         found = cells[cells["row"] == row.name]
         means = {
-            r.agent: f"{title(r.agent)} {number(r.mean)}"
+            r.agent: f"{title(r.agent)} {number(r.mean)}{incomplete(r)}"
             for r in found[found["mean"].notna()].itertuples()
             if r.measure == own_measure(r.agent, measure)
         }
@@ -44,8 +44,12 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
 
 def _p(test: Any) -> str:
     """Welch's p, and Holm's where other rows make it larger."""
-    own, adjusted = p_value(test.p_welch), p_value(test.p_welch_holm)
-    return f"p {own}" + ("" if own == adjusted else f", adjusted by Holm {adjusted}")
+    adjusted = f", adjusted by Holm {p_value(test.p_welch_holm)}" if _is_adjusted(test) else ""
+    return f"p {p_value(test.p_welch)}{adjusted}"
+
+
+def _is_adjusted(test: Any) -> bool:
+    return p_value(test.p_welch) != p_value(test.p_welch_holm)
 
 
 def _verdict(test: Any) -> str:
@@ -62,6 +66,6 @@ def _verdict(test: Any) -> str:
         claim = f"{x} earns significantly {more} than {y}"
     return (
         f"{claim}: {test.difference:+z.1f} (95 % interval {test.low:z.1f} to {test.high:z.1f}, "
-        f"{_p(test)}). A difference of {test.detectable:.1f} would be found with "
-        "a power of 80 %."
+        f"{_p(test)}). {'Without adjustment, a' if _is_adjusted(test) else 'A'} difference of "
+        f"{test.detectable:.1f} would be found with a power of 80 %."
     )

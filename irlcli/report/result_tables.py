@@ -18,7 +18,7 @@ from irlcli.report.compute import IMITATED, failed_to_imitate
 from irlcli.report.lineage import commits, evaluations, lineage
 from irlcli.report.parameters import Parameters, Row, Run
 from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
-from irlcli.report.text import number, p_value, percent
+from irlcli.report.text import incomplete, number, p_value, percent
 
 _MAIN_NOTE = (
     "Mean true return ± standard deviation over seeds. Training experts, reused: the mean over the "
@@ -32,7 +32,7 @@ _TEST_NOTE = (
 # Patterns of cells, and what to say below a table that has such a cell.
 _MARKS = {
     r"\(\d+/\d+\)": "(3/5): three of five seeds exist.",
-    r"\(part\)": "(part): some evaluations are missing.",
+    r"\(part\)": "(part): some evaluations are missing; differences and p-values leave their seeds out.",
     "†": f"† in a training setting the student stays below {IMITATED:.0%} of the expert.",
     "‡": "‡ runs of more than one commit or set of libraries.",
     "^progress$": PROGRESS,
@@ -181,10 +181,7 @@ def _cell(cell: Any) -> str:
     text = f"{cell.mean:z.1f}"
     if not pd.isna(cell.deviation):
         text += f" ± {cell.deviation:.1f}"
-    if cell.seeds < cell.seeds_wanted:
-        text += f" ({cell.seeds}/{cell.seeds_wanted})"
-    if cell.partial:
-        text += " (part)"
+    text += incomplete(cell)
     if failed_to_imitate(cell):
         text += " †"
     return text + (" ‡" if cell.mixed else "")

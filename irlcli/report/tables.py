@@ -22,6 +22,7 @@ _LATEX = {
     "±": r"$\pm$",
     "<": r"$<$",
     ">": r"$>$",
+    "|": r"\textbar{}",
     "†": r"\textdagger{}",
     "‡": r"\textdaggerdbl{}",
 }

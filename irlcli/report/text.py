@@ -1,4 +1,4 @@
-"""Numbers as text. A missing one is ``-``, and none is a negative zero."""
+"""Numbers and their marks as text. A missing one is ``-``, and none is a negative zero."""
 
 from typing import Any
 
@@ -13,6 +13,12 @@ def number(value: Any, digits: int = 1) -> str:
 def percent(share: Any) -> str:
     """A share of one, to a tenth of a per cent."""
     return "-" if pd.isna(share) else f"{share:z.1%}"
+
+
+def incomplete(cell: Any) -> str:
+    """Marks a cell that lacks seeds, or evaluations of the seeds it has."""
+    few = f" ({cell.seeds}/{cell.seeds_wanted})" if cell.seeds < cell.seeds_wanted else ""
+    return few + (" (part)" if cell.partial else "")
 
 
 def p_value(value: Any) -> str:

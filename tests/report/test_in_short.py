@@ -42,14 +42,16 @@ def test_significance_is_that_after_holm():
 
 
 def test_the_detectable_difference_follows_the_claim():
-    """Deviations of 1 and sqrt(7), three seeds each: Welch's test has 2.6 degrees of freedom."""
-    assert "A difference of 7.6 would be found with a power of 80 %." in lines(complete())[BOUNCE]
+    line = lines(complete())[BOUNCE]
+    assert "0.321, adjusted by Holm 0.643). Without adjustment, a difference of 8.1 would be" in line
+    line = lines(complete() | {(POWER, "irm", "transfer"): [5.0]})[BOUNCE]
+    assert "p 0.321). A difference of 8.1 would be found with a power of 80 %." in line
 
 
 def test_one_seed_has_returns_and_no_test():
     values = complete() | {(BOUNCE, m, "transfer"): [5.0] for m in ("erm", "irm")}
     line = lines(values)[BOUNCE]
-    assert "AIRL-ERM 5.0; AIRL-IRM 5.0" in line
+    assert "AIRL-ERM 5.0 (1/3); AIRL-IRM 5.0 (1/3)" in line
     assert "No test of AIRL-IRM against AIRL-ERM: one seed has no variance" in line
 
 

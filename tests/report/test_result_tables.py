@@ -118,6 +118,7 @@ def test_methods_outside_the_table_have_a_title_and_a_colour():
 
 def test_markdown_and_latex_escape_special_characters():
     assert markdown_table(["a"], [["x|y"]]).splitlines()[-1] == "| x\\|y |"
+    assert latex_text("mean |logit|") == r"mean \textbar{}logit\textbar{}"
     assert latex_text("50 % of a_b & {c} ± 1 < 2") == (r"50 \% of a\_b \& \{c\} $\pm$ 1 $<$ 2")
     found = latex_table(["a", "b"], [["1", "2"]], "C")
     assert found.index(r"\toprule") < found.index(r"\midrule") < found.index(r"\bottomrule")

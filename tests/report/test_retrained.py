@@ -155,6 +155,13 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
     assert report.reward_quality["verdicts"].tolist() == [[]]
     assert any("bounce=0.9 the expert earns no more" in caveat for caveat in report.caveats)
     assert [r.verdict for s in weak.settings for r in s.retrained] == [None, None]
+    # Beside an idle agent that earns more, the verdict stays.
+    members[1] = member("random", "random", -100.0)
+    idle = assess("lunar-lander", reward, [*members, member("idle", "idle", 100.0)], {})
+    report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): idle})
+    assert report.reward_quality["verdicts"].tolist() == [["matches the expert"]]
+    (named,) = (c for c in report.caveats if c.startswith("Weak expert"))
+    assert "no more than the idle agent" in named
 
 
 def test_the_budget_of_retraining_from_the_student_is_listed():

@@ -97,7 +97,18 @@ def test_the_detectable_difference_is_cohens(n, effect):
     assert detectable(n) <= effect < detectable(n - 1)
 
 
-@pytest.mark.parametrize(("deviations", "sizes"), [((3.0, 3.0), (9, 9)), ((9.0, 0.5), (5, 5))])
+@pytest.mark.parametrize(
+    ("deviations", "sizes"),
+    [
+        ((3.0, 3.0), (9, 9)),
+        ((9.0, 0.5), (5, 5)),
+        ((1.0, 2.0), (2, 2)),
+        ((1.0, 1.0), (3, 3)),
+        ((1.0, 3.0), (5, 2)),
+        ((1.0, 0.0), (2, 4)),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Precision loss occurred")
 def test_the_detectable_difference_is_found_four_times_in_five(deviations, sizes):
     rng = np.random.default_rng(0)
     x, y = (with_moments(0.0, sd, n) for sd, n in zip(deviations, sizes, strict=True))
