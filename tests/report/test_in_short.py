@@ -43,7 +43,9 @@ def test_significance_is_that_after_holm():
 
 def test_the_detectable_difference_follows_the_claim():
     line = lines(complete())[BOUNCE]
-    assert "0.321, adjusted by Holm 0.643). Without adjustment, a difference of 8.1 would be" in line
+    assert (
+        "0.321, adjusted by Holm 0.643). Without adjustment, a difference of 8.1 would be" in line
+    )
     line = lines(complete() | {(POWER, "irm", "transfer"): [5.0]})[BOUNCE]
     assert "p 0.321). A difference of 8.1 would be found with a power of 80 %." in line
 
