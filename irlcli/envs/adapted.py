@@ -56,6 +56,7 @@ class Adapted(gymnasium.Wrapper):
         self.observation_space = _flat_observations(observations, name)
         self.action_space = _flat_actions(actions, name)
         self._actions: Any = actions
+        self._last = np.zeros(0, np.float32)
 
     @prints_aside()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -63,7 +64,8 @@ class Adapted(gymnasium.Wrapper):
             observation, info = self.env.reset(seed=seed, options=options)
         except (Exception, SystemExit) as error:
             raise self._failed("reset", error) from error
-        return self._seen(observation, "reset"), info
+        self._last = self._seen(observation, "reset")
+        return self._last.copy(), info
 
     @prints_aside()
     def step(self, action: Any) -> Any:
@@ -77,6 +79,7 @@ class Adapted(gymnasium.Wrapper):
                 "step", f"returned {what}, not (observation, reward, terminated, truncated, info)"
             )
         observation, reward, terminated, truncated, info = found
+        info = self._reported(info)
         try:
             reward = float(reward)
         except (TypeError, ValueError) as error:
@@ -84,14 +87,19 @@ class Adapted(gymnasium.Wrapper):
                 "step", f"returned the reward {reward!r}: it must be a number"
             ) from error
         if not abs(reward) <= _LARGEST_REWARD:
-            raise self._wrong("step", f"returned the reward {reward}: it must be finite in float32")
-        info = self._reported(info)
+            if info["error"] is None:
+                what = f"returned the reward {reward}: it must be finite in float32"
+                raise self._wrong("step", what)
+            reward = 0.0
         terminated, truncated = (
             self._flag("terminated", terminated),
             self._flag("truncated", truncated),
         )
         truncated = truncated or info["error"] is not None
-        return self._seen(observation, "step"), reward, terminated, truncated, info
+        # A simulation that failed has no next state: the last one stands for it.
+        failed = None if info["error"] is None else self._last
+        self._last = self._seen(observation, "step", failed)
+        return self._last.copy(), reward, terminated, truncated, info
 
     @prints_aside()
     def close(self) -> None:
@@ -110,7 +118,7 @@ class Adapted(gymnasium.Wrapper):
             return action + space.start
         return np.clip(action, space.low, space.high)
 
-    def _seen(self, observation: Any, method: str) -> np.ndarray:
+    def _seen(self, observation: Any, method: str, instead: np.ndarray | None = None) -> np.ndarray:
         try:
             # A copy: the environment may return one array in every step.
             flat = np.array(observation, dtype=np.float32).reshape(-1)
@@ -122,9 +130,11 @@ class Adapted(gymnasium.Wrapper):
                 f"returned an observation of size {flat.size}, but its space has size "
                 f"{(self.observation_space.shape or ())[0]}",
             )
-        if not np.isfinite(flat).all():
+        if np.isfinite(flat).all():
+            return flat
+        if instead is None:
             raise self._wrong(method, "returned an observation that is not finite")
-        return flat
+        return instead
 
     def _flag(self, name: str, value: Any) -> bool:
         if np.size(value) != 1 or value not in (0, 1):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
+from itertools import zip_longest
 from typing import NamedTuple
 
 import gymnasium
@@ -15,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from irlcli.envs.adapted import Adapted, prints_aside
 from irlcli.envs.declared_symmetries import symmetries
 from irlcli.envs.registration import make
+from irlcli.envs.spaces import check_spaces
 from irlcli.envs.spec import EnvironmentSpec, Knob
 from irlcli.errors import IrlError, UsageError, first_line
 from irlcli.interventions import Setting, Value
@@ -97,20 +99,30 @@ def _ends(knob: Knob) -> list[Value]:
             return [Value(form, (x,)) for x in (knob.low, knob.high)]
 
 
-def _episode(spec: EnvironmentSpec, setting: Setting) -> list[np.ndarray]:
-    """An episode of random actions: observations [T + 1, D] and rewards [T]."""
+def _episode(spec: EnvironmentSpec, setting: Setting) -> np.ndarray:
+    """An episode of random actions in a world of its own, see :func:`_moves`."""
     with closing(make(spec.name, setting)) as world:
-        actions = np.random.default_rng(_SEED)
-        world.action_space.seed(int(actions.integers(2**31)))
-        observation, _ = world.reset(seed=_SEED)
-        observations, rewards = [observation], []
-        for _ in range(min(spec.max_episode_steps, _MOST_STEPS)):
-            observation, reward, terminated, truncated, _ = world.step(world.action_space.sample())
-            observations.append(observation)
-            rewards.append(reward)
-            if terminated or truncated:
-                break
-        return [np.stack(observations), np.array(rewards)]
+        return np.stack([*_moves(spec, world)])
+
+
+def _moves(spec: EnvironmentSpec, world: gymnasium.Env, seed: int = _SEED) -> Iterator[np.ndarray]:
+    """An episode of random actions: each step's observation and reward [D + 1]."""
+    world.action_space.seed(int(np.random.default_rng(seed).integers(2**31)))
+    observation, _ = world.reset(seed=seed)
+    yield np.array([*observation, 0.0])
+    for _ in range(min(spec.max_episode_steps, _MOST_STEPS)):
+        observation, reward, terminated, truncated, _ = world.step(world.action_space.sample())
+        yield np.array([*observation, reward])
+        if terminated or truncated:
+            return
+
+
+def _together(spec: EnvironmentSpec, settings: Sequence[Setting]) -> list[np.ndarray]:
+    """An episode of each setting, in worlds that are made first and then stepped in turn."""
+    with ExitStack() as stack:
+        worlds = [stack.enter_context(closing(make(spec.name, each))) for each in settings]
+        steps = list(zip_longest(*(_moves(spec, world) for world in worlds)))
+    return [np.stack([step for step in of if step is not None]) for of in zip(*steps, strict=True)]
 
 
 @prints_aside()
@@ -128,8 +140,11 @@ def _check_env(spec: EnvironmentSpec) -> None:
 
 
 def _check_seeds(spec: EnvironmentSpec) -> None:
-    if not _equal(*(_episode(spec, Setting()) for _ in range(2))):
-        raise _Wrong("two episodes of the same seed and the same actions differ")
+    with closing(make(spec.name, Setting())) as world:
+        first, _, again = (np.stack([*_moves(spec, world, s)]) for s in (_SEED, _SEED + 1, _SEED))
+    for what, other in (("", _episode(spec, Setting())), (", the second after others", again)):
+        if not np.array_equal(first, other):
+            raise _Wrong(f"two episodes of the same seed and the same actions differ{what}")
 
 
 def _check_symmetries(spec: EnvironmentSpec) -> None:
@@ -145,9 +160,8 @@ def _check_ends(spec: EnvironmentSpec, ends: Sequence[Setting]) -> None:
 
 
 def _check_one(spec: EnvironmentSpec, name: str) -> None:
-    if not _equal(
-        _episode(spec, Setting()), _episode(spec, Setting(((name, Value("multiplier", (1.0,))),)))
-    ):
+    written = Setting(((name, Value("multiplier", (1.0,))),))
+    if not np.array_equal(_episode(spec, Setting()), _episode(spec, written)):
         raise _Wrong(
             "its episodes differ from those without it, with equal seeds and actions: let the constructor "
             "multiply, with a default of 1, or use absolute values"
@@ -155,18 +169,16 @@ def _check_one(spec: EnvironmentSpec, name: str) -> None:
 
 
 def _check_moves(spec: EnvironmentSpec, name: str, settings: Sequence[Setting]) -> None:
+    # With an observed knob, the default is not used beside the others.
+    check_spaces(spec.name, settings[1:] if spec.knobs[name].observed else settings)
     episodes = [_episode(spec, setting) for setting in settings]
-    sizes = [observations.shape[1] for observations, _ in episodes]
-    if len(set(sizes)) > 1 and not spec.knobs[name].observed:
-        raise _Wrong(
-            f"observations have {sizes[0]} numbers by default and {sizes[-1]} with {settings[-1]}: "
-            f"write observed = true in [knobs.{name}], or keep their size"
-        )
-    if all(_equal(episode, episodes[0]) for episode in episodes):
+    for setting, alone, beside in zip(settings, episodes, _together(spec, settings), strict=True):
+        if not np.array_equal(alone, beside):
+            raise _Wrong(
+                f"an episode of {setting} differs when worlds of other settings exist, with equal seeds "
+                "and actions: keep what a setting changes in the environment, not in its module or class"
+            )
+    if all(np.array_equal(episode, episodes[0]) for episode in episodes):
         raise _Wrong(
             f"episodes of {', '.join(map(str, settings))} are equal, with equal seeds and actions"
         )
-
-
-def _equal(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))

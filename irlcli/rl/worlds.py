@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from irlcli.envs.registration import factory
 from irlcli.envs.registry import environment
+from irlcli.envs.spaces import check_spaces
 from irlcli.envs.vector import Ended, VectorWorlds
 from irlcli.envs.workers import WorkerWorlds
 from irlcli.interventions import Setting
@@ -27,7 +28,11 @@ def make_worlds(env: str, settings: Sequence[Setting], count: int, workers: int 
 
     More than one worker (at most one per world) steps them in as many processes, with the same
     results.
+
+    Raises:
+        UsageError: see :func:`irlcli.envs.spaces.check_spaces`.
     """
+    check_spaces(env, settings)
     factories = [factory(env, settings[index]) for index in world_settings(count, len(settings))]
     limit = environment(env).max_episode_steps
     if min(workers, count) > 1:

@@ -128,11 +128,13 @@ def _check_experts(
 
 def run(job: Job) -> None:
     """Roll every expert out in its own setting."""
+    from irlcli.envs.spaces import check_spaces
     from irlcli.rl.rollout import roll_out
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
     env = p.environment.name
+    check_spaces(env, [parse_setting(env, text) for text in p.settings])
     found = (
         roll_out(
             env,

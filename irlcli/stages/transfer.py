@@ -79,6 +79,7 @@ def run(job: Job) -> None:
     """Train on g / scale. The true return is in the metrics only: no training or choice uses it."""
     from irlcli.data.outputs import write_metrics, write_policy
     from irlcli.data.tensors import load_reward_file
+    from irlcli.envs.spaces import check_spaces
     from irlcli.rl import algorithm
     from irlcli.rl.loop import Training
     from irlcli.rl.policy import require_observations
@@ -90,6 +91,7 @@ def run(job: Job) -> None:
     env, config = p.environment.name, p.transfer.algorithm_config
     settings = [parse_setting(env, p.setting)]
     model, origin = load_reward_file(job.inputs["reward"])
+    check_spaces(env, [*(parse_setting(env, text) for text in origin.settings), *settings])
     student = None
     if "start" in job.inputs:
         student, config = _student(job.inputs["start"], config)

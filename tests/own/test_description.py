@@ -134,6 +134,13 @@ WRONG = [
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\nfoo = 1', 2, "'env.foo'", "known: "),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\narguments.a = nan', 2, "env.arguments.a", "num"),
     ('id = "cart:Cart-v0"', 'id = "cart:Cart-v0"\narguments.drag = 1', 2, "knobs.drag", "omit"),
+    (
+        'id = "cart:Cart-v0"',
+        'id = "cart:Cart-v0"\narguments.models = ["./cart.toml"]',
+        2,
+        "names the file ./cart.toml",
+        "env.files",
+    ),
     ("max_episode_steps = 50", "max_episode_steps = 0", 2, "env.max_episode_steps", "own-"),
     (
         "max_episode_steps = 50",

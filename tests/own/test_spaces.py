@@ -239,6 +239,18 @@ def test_a_progress_is_a_number_and_an_error_is_text():
     assert truncated
 
 
+def test_a_step_that_reports_an_error_may_return_values_that_are_not_finite():
+    class Diverging(Counter):
+        def step(self, action):
+            return [np.nan], np.inf, False, False, {"error": "diverged"}
+
+    world = Adapted(Diverging(), "diverging")
+    started, _ = world.reset(seed=0)
+    observation, reward, _, truncated, info = world.step(np.zeros(1))
+    assert (observation.tolist(), reward, truncated) == (started.tolist(), 0.0, True)
+    assert info["error"] == "diverged"
+
+
 @pytest.mark.parametrize("none", [None, False, 0, "", np.False_, [], {}])
 def test_an_error_that_says_nothing_is_none(none):
     class Quiet(Counter):
@@ -355,6 +367,18 @@ def test_the_example_passes_every_check(bench):
             "SystemExit",
         ),
         (RETURNED, "return 'text'", "it can be made", "no array"),
+        (
+            "self.speed = 0.0",
+            "self.speed = getattr(self, 'speed', 0.0)",
+            "equal seeds give equal episodes",
+            "the second after others",
+        ),
+        (
+            "self.drag = drag",
+            "Cart.drag = drag",
+            "drag: it changes episodes",
+            "when worlds of other settings exist",
+        ),
     ],
 )
 def test_checks_find_what_is_wrong(bench, old, new, failed, named):
@@ -388,10 +412,11 @@ def test_declared_symmetries_are_checked(bench, old, new, verdict, named):
 
 
 def test_a_knob_that_extends_the_observation_must_say_so(bench):
+    bench.edit(bench.module, "drag=0.1,", "drag=None,")
     bench.edit(
         bench.module,
         "self.drag = drag",
-        "self.drag = drag\n        if drag != 0.1:\n"
+        "self.drag = 0.1 if drag is None else drag\n        if drag is not None:\n"
         f"            self.observation_space = {SPACES}Box(-10.0, 10.0, (3,), np.float32)",
     )
     bench.edit(
@@ -405,6 +430,39 @@ def test_a_knob_that_extends_the_observation_must_say_so(bench):
     bench.edit(bench.toml, 'argument = "drag"', 'argument = "drag"\nobserved = true')
     again = bench.irl("envs", "check", "cart.toml")
     assert again.code == 0, again.out
+
+
+FORCES = "self.action_space = gymnasium.spaces.Box(-mass_scale, mass_scale, (1,), np.float32)"
+LONGER = (
+    "self.observation_space = gymnasium.spaces.Box(-10.0, 10.0, (int(mass_scale),), np.float32)"
+)
+ENTRIES = "return np.full(self.observation_space.shape, self.position / 10, np.float32)"
+
+
+@pytest.mark.parametrize(
+    ("spaces", "observed", "named"),
+    [
+        (FORCES, False, "has actions in Box(-2.0, 2.0, (1,), float32) with mass=2x, in"),
+        (LONGER, True, "has 2 numbers in an observation with mass=2x, 3 with mass=3x"),
+    ],
+)
+def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observed, named):
+    """Each alone has an expert; demonstrations and rewards would mix them."""
+    bench.edit(bench.module, "self.drag = drag", f"self.drag = drag\n        {spaces}")
+    if observed:
+        bench.edit(bench.module, RETURNED, ENTRIES)
+        bench.edit(
+            bench.toml, 'argument = "mass_scale"', 'argument = "mass_scale"\nobserved = true'
+        )
+        bench.edit(bench.toml, "low = 0.1", "low = 1.0")
+    assert bench.irl(*COLLECT, *ONE, "--name", "one").code == 0
+    done = bench.irl(*COLLECT, "--intervention", "mass=2x,3x", "--name", "demos")
+    error, hint = done.err.splitlines()[-2:]
+    assert done.code == 2 and named in error and hint.startswith("hint: "), done.err
+    checked = bench.irl("envs", "check", "cart.toml")
+    assert (
+        checked.code == 1 and ("has actions in" if not observed else "numbers in an") in checked.out
+    )
 
 
 @pytest.mark.parametrize(("reward", "warned"), [(-100.0, True), (100.0, False)])
