@@ -377,19 +377,20 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     control: ControlConfig = ControlConfig()
 
     def expert_of(self, setting: Setting) -> ExpertConfig:
-        """The config of the expert of ``setting``, with the overrides of its only knob."""
+        """The config of the expert of ``setting``, with a knob's own, see :meth:`_of`."""
         return self._of("expert", setting)
 
     def airl_of(self, settings: Sequence[Setting]) -> AIRLConfig:
-        """The config of a reward learned in ``settings``, with the overrides of their only knob."""
+        """The config of a reward learned in ``settings``, with a knob's own, see :meth:`_of`."""
         return self._of("airl", *settings)
 
     def transfer_of(self, setting: Setting) -> TransferConfig:
-        """The config of a policy retrained in ``setting``, with the overrides of its only knob."""
+        """The config of a policy retrained in ``setting``, with a knob's own, see :meth:`_of`."""
         return self._of("transfer", setting)
 
     def _of(self, section: str, *settings: Setting) -> Any:
-        knobs = {knob for setting in settings for knob in setting.knobs}
-        only = self.interventions.get(*knobs) if len(knobs) == 1 else None
-        own = getattr(only, section, None)
-        return getattr(self, section) if own is None else own
+        """The ``section`` of the one knob in ``settings`` that has its own; none counts beside another."""
+        knobs = {knob for setting in settings for knob in setting.knobs} & set(self.interventions)
+        own = [getattr(self.interventions[knob], section) for knob in knobs]
+        given = [config for config in own if config is not None]
+        return given[0] if len(given) == 1 else getattr(self, section)

@@ -24,7 +24,7 @@ from irlcli.configs.schema import (
 )
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.interventions import Setting, parse_settings
+from irlcli.interventions import Setting, parse_setting, parse_settings
 from irlcli.store import canonical_json
 
 LANDER = "lunar-lander"
@@ -490,6 +490,9 @@ def test_a_knobs_challengers_learn_as_its_retrained_policies_do(toml):
     # The unchanged world beside it changes no knob; another knob makes it a reward of both.
     assert config.airl_of([Setting(), legs]) == config.airl_of([legs]) != config.airl
     assert config.airl_of([legs, friction]) == config.airl
+    heavy = parse_setting("ant", "leg-length=2x,mass=2x")
+    assert config.airl_of([heavy]) == config.airl_of([legs])
+    assert config.expert_of(heavy) == config.expert_of(legs) != config.expert
     # Without a reward learning of its own, nothing else differs.
     smoke = load_config("ant", profile="smoke")
     own = smoke.airl_of([legs]).challenger
@@ -684,12 +687,11 @@ def test_a_cap_on_the_noise_of_gsde_is_refused():
         relevant_ppo(capped, False, "expert.ppo")
 
 
-def test_rewards_of_two_knobs_have_the_config_of_neither():
+def test_rewards_of_two_knobs_have_the_config_of_the_one_that_has_its_own():
     config = load_config("ant")
     settings = [*parse_settings("ant", "mass=0.5x"), *parse_settings("ant", "friction=2:0.6:0.6")]
     for order in (settings, settings[::-1]):
-        assert config.airl_of(order) == config.airl
-    assert config.airl_of(settings[1:]) != config.airl
+        assert config.airl_of(order) == config.airl_of(settings[1:]) != config.airl
 
 
 def test_a_later_count_of_demonstrations_wins_over_a_knobs_own(tmp_path):
