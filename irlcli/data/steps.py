@@ -245,7 +245,7 @@ class Check:
         at_limit = (t == self.horizon - 1) & ~ended
         self.irregular.long += int((at_limit & ~last).sum())
         self.irregular.unended += int(unended.sum())
-        self.irregular.terminated += int(steps.terminated.sum())
+        self.irregular.terminated += int((steps.terminated & ~long).sum())
         self.irregular.terminated_at_limit += int(
             (steps.terminated & (t == self.horizon - 1)).sum()
         )

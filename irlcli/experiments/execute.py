@@ -5,6 +5,7 @@ process. A failed step stops only what depends on it.
 """
 
 import os
+import shlex
 import signal
 import subprocess
 import threading
@@ -227,6 +228,10 @@ class Execution:
             )
         else:
             why = child.failure()
+            if "--debug" in why.hint:
+                words = self._command(child.name)
+                again = shlex.join(["irl", *words[words.index("run") :], "--debug"])
+                why = why._replace(hint=f"{why.hint}: `{again}`")
         code = child.process.returncode
         if self._signals and (code < 0 or code in (0, Interrupted.exit_code)):
             self._waiting.append(child.name)

@@ -115,8 +115,11 @@ def other_versions(origin: Mapping[str, Any]) -> list[str]:
     return differing({**recorded, "irlcli": libraries()["irlcli"]})
 
 
-# What is followed by a reference; that of `--expert` stands behind its setting.
-_REFERRING = ("--demos", "--reward", "--policy", "--expert", "assess")
+# Options with a reference; that of `--expert` stands behind its setting. `irl assess` takes it bare.
+_REFERRING = ("--demos", "--reward", "--policy", "--expert")
+
+
+_OF_A_REPOSITORY = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 class _Schema(msgspec.Struct):
@@ -177,7 +180,8 @@ def by_id(command: Sequence[str], resolved: Mapping[str, str]) -> list[str]:
     for before, word in pairwise(["", *command]):
         option = word.partition("=")[0] if word.startswith("--") else before
         rest, equals, ref = word.rpartition("=")
-        known = option in _REFERRING and ref in resolved
+        bare = "assess" in command[:2] and before != "--name" and word == ref
+        known = (option in _REFERRING or bare) and ref in resolved
         words.append(f"{rest}{equals}{resolved[ref]}" if known else word)
     return words
 
@@ -203,11 +207,14 @@ def git_state(package: Path) -> dict[str, str | None]:
     if shutil.which("git") is None:
         return unknown
 
+    # A git hook runs with the variables of its own repository.
+    elsewhere = {name: of for name, of in os.environ.items() if name not in _OF_A_REPOSITORY}
+
     def git(*arguments: str) -> bytes | None:
         done = subprocess.run(
             ["git", "-C", str(package), *arguments],
             capture_output=True,
-            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0"},
+            env={**elsewhere, "GIT_OPTIONAL_LOCKS": "0"},
         )
         return done.stdout if done.returncode == 0 else None
 

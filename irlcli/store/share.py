@@ -6,7 +6,7 @@ leaves whole artefacts whose inputs are there too; the next one skips them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from irlcli.errors import IntegrityError, NewerFormat
@@ -54,8 +54,8 @@ def share(
         warn: receives what is missing of the lineage.
         start: called once with the number of artefacts and of bytes to copy. It returns a function
             that is called with the size of each chunk.
-        partial: skip, with a warning, artefacts that were made from a damaged one, instead of
-            raising.
+        partial: skip, with a warning, artefacts that are damaged in ``source``, and those that were
+            made from one, instead of raising.
 
     Raises:
         IntegrityError: a file is damaged in ``source``. Its artefact does not appear in
@@ -72,19 +72,37 @@ def share(
         copied = [a for a in wanted if a.id not in held]
         advance = start(len(copied), sum(a.manifest.size for a in copied))
         diverged = {}
+        damaged: set[str] = set()
         for artefact in wanted:
             if artefact.id not in held:
-                target.receive(source, artefact, advance)
+                try:
+                    _require(artefact, source, damaged)
+                    target.receive(source, artefact, advance)
+                except IntegrityError as error:
+                    if not partial or not error.message.startswith(f"{source.root}/"):
+                        raise
+                    warn(f"skipping artefact {artefact.id}: {error.message}")
+                    damaged.add(artefact.id)
+                    continue
             # Also of what was there: a copy may have been killed before this.
             holder = target.claim(artefact)
             if holder is not None:
                 diverged[artefact.id] = holder
-        members = {artefact.id: artefact for artefact in wanted}
+        copied = [a for a in copied if a.id not in damaged]
+        members = {a.id: a for a in wanted if a.id not in damaged}
         names = {name: id16 for name, id16 in source.names().items() if id16 in members}
         holders = {name: target.claim_name(name, members[id16]) for name, id16 in names.items()}
     taken = {name: other for name, other in holders.items() if other is not None}
     given = {name: id16 for name, id16 in names.items() if name not in taken}
     return Shared(copied, present, given, taken, diverged)
+
+
+def _require(artefact: Artefact, source: Place, damaged: Collection[str]) -> None:
+    """Refuse what was made from one of the artefacts that are ``damaged``, if there are any."""
+    if damaged:
+        lost = [a.id for a in ancestors(artefact, source.manifests(artefact.id)) if a.id in damaged]
+        if lost:
+            raise IntegrityError(f"{source.root}/{lost[0]}, from which it was made, is damaged")
 
 
 def _with_ancestors(

@@ -208,7 +208,9 @@ def test_code_that_is_not_committed_counts_new_files_too(tmp_path, monkeypatch):
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "x.pyc").write_bytes(b"x")
     (tmp_path / "notes").write_text("outside the package")
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "elsewhere"))
     assert provenance.git_state(package) == clean
+    monkeypatch.delenv("GIT_DIR")
     states = []
     for name, text in (
         ("new.py", "1"),
@@ -225,6 +227,17 @@ def test_code_that_is_not_committed_counts_new_files_too(tmp_path, monkeypatch):
     monkeypatch.setattr(irlcli, "__file__", str(package / "__init__.py"))
     recorded = provenance.Clock().attempt()
     assert (recorded.commit, recorded.dirty) == (clean["commit"], states[-1])
+
+
+def test_references_become_ids_wherever_they_stand():
+    known = {"airl": "0123", "best": "4567"}
+    for words, replaced in (
+        (["irl", "assess", "--json", "airl"], ["irl", "assess", "--json", "0123"]),
+        (["irl", "assess", "airl", "--name", "airl"], ["irl", "assess", "0123", "--name", "airl"]),
+        (["irl", "evaluate", "--policy=best"], ["irl", "evaluate", "--policy=4567"]),
+        (["irl", "transfer", "--name", "airl"], ["irl", "transfer", "--name", "airl"]),
+    ):
+        assert provenance.by_id(words, known) == replaced
 
 
 def test_a_repair_reads_what_was_read_though_names_moved(irl, store_copy):

@@ -372,3 +372,17 @@ def test_an_environment_that_draws_nothing_is_not_played(bench):
     played = bench.irl("play", learned, "--out", "cart.gif")
     assert played.code == 2 and "draws no pictures" in played.err and "render" in played.err
     assert not Path("cart.gif").exists()
+
+
+def test_a_step_that_needs_a_traceback_names_the_command_that_shows_it(bench):
+    """Steps of `irl run` are processes of their own, whose tracebacks it does not show."""
+    example = Path(__file__).parent.parent.parent / "examples" / "own-environment"
+    shutil.copy(example / "tables.toml", "tables.toml")
+    bench.edit(bench.module, "self.drag = drag", "self.drag = drag / (mass_scale - 4)")
+    done = bench.irl(
+        "run", "cart", "--experiments", "tables.toml", *SMOKE[:2], "--until", "experts"
+    )
+    assert done.code == 2
+    hint = next(line for line in done.err.splitlines() if "--debug" in line)
+    shown = bench.irl(*shlex.split(hint.split("`")[1])[1:])
+    assert "ZeroDivisionError" in shown.err and "self.drag = drag / (mass_scale - 4)" in shown.err

@@ -87,20 +87,23 @@ def test_an_artefact_of_a_newer_schema_there_is_listed_as_such(irl, store, chain
     assert "upgrade irlcli" in listed.err
 
 
+@pytest.mark.parametrize("damaged", ["manifest.json", "f"])
 @pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
 def test_what_was_made_from_a_damaged_artefact_is_left_out_of_all(
-    irl, store, chain, place, publish, tmp_path
+    irl, store, chain, place, publish, tmp_path, damaged
 ):
     other_expert = publish(store, parameters={"seed": 9}).artefact
+    store.set_name("other", other_expert)
     push(store, place, *chain.values(), other_expert)
     if "://" in place:
-        emptied(at(place, chain["demos"], "manifest.json"))
+        emptied(at(place, chain["demos"], damaged))
     else:
-        manifest = Path(place) / chain["demos"].id / "manifest.json"
-        manifest.chmod(0o644)
-        manifest.write_bytes(b"")
+        file = Path(place) / chain["demos"].id / damaged
+        file.chmod(0o644)
+        file.write_bytes(b"")
     pulled = irl("pull", "--all", "--from", place, "--store", tmp_path / "other")
     assert pulled.code == 0 and f"skipping artefact {chain['airl'].id}" in pulled.err
+    assert other(tmp_path).names() == {"other": other_expert.id}
     assert set(other(tmp_path).ids()) == {chain["expert"].id, other_expert.id}
     assert {Path(line).name for line in pulled.out.split()} == set(other(tmp_path).ids())
 
