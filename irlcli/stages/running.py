@@ -132,15 +132,19 @@ def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
 
 
 def warn_of_failures(
-    job: Job, settings: Mapping[str, "Sequence[Trajectory]"], sampled: bool
+    job: Job, settings: Mapping[str, "Sequence[Trajectory]"], deterministic: bool | None
 ) -> None:
     """Warn of demonstrations that end early and earn less than those of the setting that do not.
 
     What follows such an end is then the expert's, too, and a reward may come to pay for it.
-    ``sampled``: whether the demonstrations are known to be samples of a stochastic expert.
+    ``deterministic``: whether they are the expert's most likely actions, or samples; None: unknown.
     """
     import numpy as np
 
+    other_kind = ""
+    if deterministic is not None:
+        other = "false" if deterministic else "true"
+        other_kind = f"; see whether fewer do with --set demonstrations.deterministic={other}"
     for text, episodes in settings.items():
         early, others = (
             [t.episode_return for t in episodes if t.terminated == ended] for ended in (True, False)
@@ -148,8 +152,7 @@ def warn_of_failures(
         if early and others and np.mean(early) < np.mean(others):
             job.console.warn(
                 f"{len(early)} of {len(episodes)} demonstrations in {text} end early and earn less than "
-                "the others: a reward of absorbing states may pay for such ends"
-                + ("; collect them with --set demonstrations.deterministic=true" if sampled else "")
+                "the others: a reward of absorbing states may pay for such ends" + other_kind
             )
 
 

@@ -285,8 +285,8 @@ def _episodes(
             raise UsageError(str(error), "select by a setting, or record more episodes") from None
         episodes, held_out = [kept for kept, _ in parts], [scored for _, scored in parts]
     if p.airl.fixed_horizon:
-        sampled = demos.metadata.get("deterministic") is False
-        warn_of_failures(job, dict(zip(settings, episodes, strict=True)), sampled)
+        by_setting = dict(zip(settings, episodes, strict=True))
+        warn_of_failures(job, by_setting, demos.metadata.get("deterministic"))
     if p.airl.grouping == "shuffled":
         warn_of_labels(job, [len(group) for group in episodes])
     return episodes, held_out
