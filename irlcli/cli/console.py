@@ -57,7 +57,7 @@ class TerminalConsole:
         self._quiet = quiet
         self._live: Any = None
         self._task: Any = None
-        self._label = ""
+        self._label = self._key = ""
         self._pace, self._printed = Pace(), 0.0
         self._tensorboard = tensorboard
         self._writer: Any = None
@@ -70,9 +70,9 @@ class TerminalConsole:
         """Print above another live display; None when that display has ended."""
         self._live = live
 
-    def start(self, label: str, resumed: bool) -> None:
-        """A stage starts; ``resumed`` from a checkpoint or not."""
-        self._label = label
+    def start(self, label: str, resumed: bool, key: str = "") -> None:
+        """A stage starts; ``resumed`` from a checkpoint or not. ``key`` names its TensorBoard run."""
+        self._label, self._key = label, key
         self._pace, self._printed = Pace(), time.monotonic() - _PLAIN_SECONDS
         self._close_live()
         self.say(f"{'RESUME' if resumed else 'RUN'} {label}")
@@ -92,7 +92,7 @@ class TerminalConsole:
         if self._tensorboard is None:
             return
         if self._writer is None:
-            directory = self._label.replace(" ", "_").replace(",", "")
+            directory = f"{self._label} {self._key[:8]}".replace(" ", "_").replace(",", "")
             from torch.utils.tensorboard import SummaryWriter
 
             self._writer = SummaryWriter(str(self._tensorboard / directory))

@@ -26,8 +26,8 @@ CHECKPOINT_SECONDS = 10.0
 class RunConsole(Console, Protocol):
     """What a runner and a session tell the user, beside what their stages do."""
 
-    def start(self, label: str, resumed: bool) -> None:
-        """A stage starts; ``resumed`` from a checkpoint or not."""
+    def start(self, label: str, resumed: bool, key: str = "") -> None:
+        """A stage starts; ``resumed`` from a checkpoint or not. Several keys can have one label."""
 
     def finish(self, label: str, artefact: Artefact, hit: bool) -> None:
         """A stage ended, or its artefact existed (``hit``)."""
@@ -205,7 +205,7 @@ class Runner:
         checkpoints = StageCheckpoints(
             request.stage, scratch, self.console, self.checkpoint_seconds
         )
-        self.console.start(request.label, checkpoints.load() is not None)
+        self.console.start(request.label, checkpoints.load() is not None, record.key)
         output = scratch.new_output()
         job = Job(request.parameters, inputs, output, checkpoints, self.console, self.workers)
         with checkpoints.listening():

@@ -69,8 +69,8 @@ class NotebookConsole(Silent):
         self._pace, self._updated = Pace(), 0.0
         self._handle: Any = None
 
-    def start(self, label: str, resumed: bool) -> None:
-        """A stage starts; ``resumed`` from a checkpoint or not."""
+    def start(self, label: str, resumed: bool, key: str = "") -> None:
+        """A stage starts; ``resumed`` from a checkpoint or not. ``key`` is not shown."""
         self._label, self._pace, self._updated = label, Pace(), 0.0
         self._show(_Line(f"{'RESUME' if resumed else 'RUN'} {label}"))
 

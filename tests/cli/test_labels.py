@@ -241,3 +241,12 @@ def test_gc_says_what_an_unused_evaluation_was_made_from(irl, store_copy):
     lines = dict(line.split(maxsplit=1) for line in done.out.splitlines())
     evaluated = [a for a in store.artefacts() if "policy" in a.manifest.record.inputs]
     assert evaluated and all(" of train-" in lines[a.id] for a in evaluated)
+
+
+def test_trainings_with_one_label_have_runs_of_their_own_in_tensorboard(irl, store_copy, tmp_path):
+    for rate in ("0.001", "0.002"):
+        line = [*TRAIN, *SMOKE, "--seed", "8", "--set", f"airl.learning_rate={rate}"]
+        done = irl(*line, "--tensorboard", tmp_path / "logs", "--store", store_copy.path)
+        assert done.code == 0, done.err
+    runs = list((tmp_path / "logs").iterdir())
+    assert len(runs) == 2 and all(len(list(run.glob("events*"))) == 1 for run in runs)
