@@ -62,6 +62,17 @@ def described(request: Request) -> Any | None:
     return None if spec is None or spec.own is None else spec.own.document
 
 
+def other_description(request: Request, artefact: Artefact) -> str:
+    """The name of the environment that ``artefact`` describes otherwise than ``request``, if any.
+
+    Both have one key: they differ in the budgets of later stages, for example.
+    """
+    document = described(request)
+    recorded = artefact.provenance().get("environment") if document is not None else None
+    differs = recorded is not None and recorded != document
+    return request.parameters.environment.name if differs else ""
+
+
 def _described(artefact: Artefact, made: EnvironmentKey, own: OwnKey) -> EnvironmentSpec:
     from irlcli.envs.own import from_document
 

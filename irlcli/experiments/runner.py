@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed, file_failure
 from irlcli.experiments.inputs import checked, foreign_source, source_in
-from irlcli.experiments.introduce import described
+from irlcli.experiments.introduce import described, other_description
 from irlcli.experiments.status import Lookup, Step, key_record
 from irlcli.stages.base import Console, From, Job, Request, Source
 from irlcli.store import Artefact, KeyRecord, Store
@@ -119,7 +119,13 @@ class Runner:
             self.store.create()
             # From the first artefact that is looked up to the last one that is made from it.
             with self.store.in_use(self.wait, partial(self.console.wait, "the store")):
-                return self._run(request, {})
+                artefact = self._run(request, {})
+        if other := other_description(request, artefact):
+            self.console.warn(
+                f"{artefact.id} holds another description of {other}, made before the file changed; "
+                "commands that read it use that one, unless --env names the file"
+            )
+        return artefact
 
     def copy(self, request: Request, lookup: Lookup) -> Artefact | None:
         """A verified copy from one of the sources.

@@ -386,3 +386,14 @@ def test_a_step_that_needs_a_traceback_names_the_command_that_shows_it(bench):
     hint = next(line for line in done.err.splitlines() if "--debug" in line)
     shown = bench.irl(*shlex.split(hint.split("`")[1])[1:])
     assert "ZeroDivisionError" in shown.err and "self.drag = drag / (mass_scale - 4)" in shown.err
+
+
+def test_a_hit_that_holds_an_older_description_is_named(bench):
+    line = ("collect-experts", "--env", "cart.toml", "--intervention", "mass=1x,2x", *SMOKE)
+    assert "another description" not in bench.irl(*line, "--name", "demos").err
+    assert "another description" not in bench.irl(*line, "--name", "demos").err
+    bench.edit(bench.toml, "[profiles.smoke.airl]", "[profiles.smoke.airl]\nlearning_rate = 0.01")
+    done = bench.irl(*line, "--name", "demos")
+    assert done.code == 0 and "holds another description of cart" in done.err
+    learned = ("train-airl", "--demos", "demos", "--method", "erm", *SMOKE)
+    assert "another description" not in bench.irl(*learned).err
