@@ -134,7 +134,8 @@ def load_saved(
         if not _fit(own, theirs):
             raise UsageError(
                 f"{name} has {what} in {own}, but {env} {setting} in {theirs}",
-                "name an expert that was trained in this environment",
+                "name an expert that was trained in this environment; stable-baselines3 counts indices "
+                "from 0, so they need a wrapper if the environment does not",
             )
     if isinstance(model.policy, ActorCriticPolicy) and model.policy.squash_output:
         raise UsageError(
@@ -195,12 +196,13 @@ def _algorithm(name: str, fields: Mapping[str, Any]) -> type[BaseAlgorithm]:
 
 
 def _fit(one: gymnasium.Space, other: gymnasium.Space) -> bool:
+    """Whether a model with space ``one`` can act in or observe ``other``; it counts indices from 0."""
     if isinstance(one, Box) and isinstance(other, Box):
         return one.shape == other.shape and (
             np.allclose(one.low, other.low) and np.allclose(one.high, other.high)
         )
     if isinstance(one, Discrete) and isinstance(other, Discrete):
-        return (int(one.n), int(one.start)) == (int(other.n), int(other.start))
+        return int(one.start) == 0 and int(one.n) == int(other.n)
     if isinstance(one, MultiDiscrete) and isinstance(other, MultiDiscrete):
-        return one == other
+        return not one.start.any() and np.array_equal(one.nvec, other.nvec)
     return False
