@@ -46,6 +46,22 @@ def test_cut_takes_an_episode_without_its_end_and_says_so(irl, store_copy, expor
     assert done.code == 0 and "1 episode" in done.err
 
 
+@pytest.mark.parametrize("beyond", [0, 5])
+def test_an_end_that_is_cut_off_is_no_termination(irl, tmp_path, beyond):
+    """A reacher's episode never terminates; one that runs past the limit is cut there."""
+    steps = 150 + beyond
+    states = np.zeros((steps, 9), np.float32)
+    columns = {"obs": list(states), "next_obs": list(states), "action": [[0.0, 0.0]] * steps}
+    ends = [False] * (steps - 1) + [True]
+    table = pa.table({**columns, "reward": [0.0] * steps, "terminated": ends})
+    pq.write_table(table, tmp_path / "long.parquet")
+    line = ["import", tmp_path / "long.parquet", "--env", "reacher"]
+    line += ["--intervention", "gravity=0.5x", "--cut", "--store", tmp_path / "runs"]
+    done = irl(*line)
+    assert done.code == 0, done.err
+    assert ("episodes are terminated" in done.err) == (beyond == 0)
+
+
 def test_lineage_names_the_recording_that_was_used(irl, store_copy, exported, tmp_path):
     """Other files may hold the same episodes."""
     used = imported(irl, store_copy, exported, *LANDER)
