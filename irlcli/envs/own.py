@@ -176,7 +176,7 @@ def _check_files_named(value: Any, files: Sequence[str], directory: Path) -> Non
     """
     match value:
         case str() if any(letter in value for letter in "./"):
-            known = any(Path(value).match(pattern) for pattern in files)
+            known = any(pattern and Path(value).match(pattern) for pattern in files)
             if not known and any(path.is_file() for path in (Path(value), directory / value)):
                 raise UsageError(
                     f"env.arguments names the file {value}, whose content would be in no key",
