@@ -103,6 +103,10 @@ class TerminalConsole:
         """Print a warning, also with ``--quiet``."""
         self._print(f"warning: {message}", style="bold yellow")
 
+    def hint(self, text: str) -> None:
+        """Print the hint of a warning, also with ``--quiet``."""
+        self._print(f"hint: {text}")
+
     def wait(self, label: str, holder: str) -> None:
         """Another process makes the same artefact, or runs gc."""
         self.say(f"WAIT {label}: {holder} is at work on it")

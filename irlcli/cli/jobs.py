@@ -55,7 +55,7 @@ class PlainJobs:
     def failed(self, name: str, failure: Failure) -> None:
         self._console.warn(f"{name} failed: {failure.message}")
         if failure.hint:
-            self._console.say(f"hint: {failure.hint}")
+            self._console.hint(failure.hint)
 
     def stopping(self, again: str = "to stop at once") -> None:
         self._console.warn(

@@ -379,9 +379,7 @@ def test_a_step_that_needs_a_traceback_names_the_command_that_shows_it(bench):
     example = Path(__file__).parent.parent.parent / "examples" / "own-environment"
     shutil.copy(example / "tables.toml", "tables.toml")
     bench.edit(bench.module, "self.drag = drag", "self.drag = drag / (mass_scale - 4)")
-    done = bench.irl(
-        "run", "cart", "--experiments", "tables.toml", *SMOKE[:2], "--until", "experts"
-    )
+    done = bench.irl("run", "cart", "--experiments", "tables.toml", *SMOKE, "--until", "experts")
     assert done.code == 2
     hint = next(line for line in done.err.splitlines() if "--debug" in line)
     shown = bench.irl(*shlex.split(hint.split("`")[1])[1:])
