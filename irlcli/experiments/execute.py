@@ -228,6 +228,7 @@ class Execution:
             )
         else:
             why = child.failure()
+            # The traceback is that process's own: only a command that runs no other one shows it.
             if "--debug" in why.hint:
                 words = self._command(child.name)
                 again = shlex.join(["irl", *words[words.index("run") :], "--debug"])

@@ -113,7 +113,7 @@ def _earned_in(setting: str, points: pd.DataFrame) -> pd.Series:
         for (agent, measure), group in learned.groupby(["agent", "measure"], sort=False)
     }
     if len(reused):
-        earned["policies of the best training expert"] = reused["true_return"].max()
+        earned["episodes of the best training expert"] = reused["true_return"].max()
     return pd.Series(earned, dtype=float)
 
 

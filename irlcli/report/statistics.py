@@ -149,8 +149,8 @@ def detectable_difference(x: np.ndarray, y: np.ndarray) -> float:
     few seeds estimate roughly. n and m are 2 or more, and one of the samples varies.
     """
     true_x, true_y = x.var(ddof=1) / len(x), y.var(ddof=1) / len(y)
-    # The test estimates both variances and its degrees of freedom. Given these the difference of
-    # means is normal; their mean is taken by quadrature over the quantiles of both variances.
+    # The test estimates both variances, and from them its degrees of freedom. Given the estimates,
+    # the power is a normal tail; it is averaged over them by quadrature.
     (drawn_x, p), (drawn_y, q) = _variances(true_x, len(x) - 1), _variances(true_y, len(y) - 1)
     of_x, of_y = drawn_x[:, None], drawn_y[None, :]
     freedom = (of_x + of_y) ** 2 / (of_x**2 / (len(x) - 1) + of_y**2 / (len(y) - 1))
