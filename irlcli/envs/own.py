@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args
 
@@ -111,7 +111,7 @@ def from_document(
         name = env.name or (file.stem if file is not None else "")
         _check_name(name)
         if file is not None:
-            _check_files_named(env.arguments, env.files, file.parent)
+            _check_files_named(env.arguments, file.parent)
     except UsageError as error:
         raise UsageError(f"{source}: {error.message}", error.hint) from None
     directory = None if file is None else file.parent
@@ -169,22 +169,21 @@ def from_document(
     return spec._replace(own=spec.own._replace(document=whole))
 
 
-def _check_files_named(value: Any, files: Sequence[str], directory: Path) -> None:
-    """Refuse the name of a file in ``env.arguments`` that ``env.files`` does not cover.
+def _check_files_named(value: Any, directory: Path) -> None:
+    """Refuse the name of a file in ``env.arguments``.
 
-    Its content would be in no key, so results of an edited file would be hits.
+    Its content would be in no key, and the name means another file in another working directory.
     """
     match value:
         case str() if any(letter in value for letter in "./"):
-            known = any(pattern and Path(value).match(pattern) for pattern in files)
-            if not known and any(path.is_file() for path in (Path(value), directory / value)):
+            if any(path.is_file() for path in (Path(value), directory / value)):
                 raise UsageError(
                     f"env.arguments names the file {value}, whose content would be in no key",
-                    "let a class in a module beside the TOML file pass it, and name it in env.files",
+                    "open it in the environment's module, beside __file__, and list it in env.files",
                 )
         case dict() | list():
             for inner in value.values() if isinstance(value, dict) else value:
-                _check_files_named(inner, files, directory)
+                _check_files_named(inner, directory)
 
 
 def module_of(gym_id: str | None, entry_point: str | None) -> str:
