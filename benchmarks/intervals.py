@@ -5,6 +5,8 @@ expert that the students earn in the mean over seeds, what the training experts 
 settings, and the mean over all methods, seed by seed, of what retraining earns above the student
 (t-test). Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
+With ``--pool`` the reports are one: each has other seeds of the same rows, measured with the same
+experts.
 """
 
 from __future__ import annotations
@@ -19,10 +21,12 @@ from irlcli.report.parameters import EXPERT_BY_REWARD
 from irlcli.report.statistics import compare, paired_p
 
 
-def main(reports: list[Path]) -> None:
+def main(reports: list[Path], pool: bool) -> None:
     """Print a line for each row and measure, and one for retraining."""
-    for report in reports:
-        seeds = pd.read_csv(report / "seeds.csv")
+    tables = {report.name: pd.read_csv(report / "seeds.csv") for report in reports}
+    if pool:
+        tables = {" + ".join(tables): pooled([*tables.values()])}
+    for name, seeds in tables.items():
         learned = seeds[seeds["agent"].isin([*METHODS]) & (seeds["measure"] != EXPERT_BY_REWARD)]
         for (row, measure), points in learned.groupby(["row", "measure"], sort=False):
             by_seed = points.groupby(["agent", "seed"])["true_return"].mean()
@@ -30,12 +34,17 @@ def main(reports: list[Path]) -> None:
                 found = compare(by_seed["irm"].tolist(), by_seed["erm"].tolist())
                 if found.interval is not None:
                     low, high = found.interval
+                    means = ", ".join(
+                        f"{method.upper()} {by_seed[method].mean():.1f} ± {by_seed[method].std():.1f} "
+                        f"({len(by_seed[method])} seeds)"
+                        for method in ("erm", "irm")
+                    )
                     print(
-                        f"{report.name}: {row}, {measure}: IRM - ERM {found.difference:.1f} "
+                        f"{name}: {row}, {measure}: {means}, IRM - ERM {found.difference:.1f} "
                         f"[{low:.1f}, {high:.1f}], detectable {found.detectable:.1f}, p {found.welch:.3f}"
                     )
-        _print_imitation(report.name, seeds)
-        _print_reused(report.name, seeds)
+        _print_imitation(name, seeds)
+        _print_reused(name, seeds)
         for row, points in learned.groupby("row", sort=False):
             means = points.pivot_table("true_return", ["agent", "seed"], "measure")
             if {"transfer", "zero-shot"} <= {*means}:
@@ -43,9 +52,27 @@ def main(reports: list[Path]) -> None:
                 p = paired_p(both["transfer"].tolist(), both["zero-shot"].tolist())
                 gain = (both["transfer"] - both["zero-shot"]).mean()
                 shown = "-" if p is None else f"{p:.3f}"
-                print(
-                    f"{report.name}: {row}, all methods: transfer - zero-shot {gain:.1f}, p {shown}"
-                )
+                print(f"{name}: {row}, all methods: transfer - zero-shot {gain:.1f}, p {shown}")
+
+
+def pooled(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """The tables of several reports as one, with the first report's agents that learn nothing.
+
+    Raises:
+        ValueError: two tables have the same seed of a method, or other evaluations of an expert.
+    """
+    everything = pd.concat(tables, ignore_index=True)
+    of_methods = everything["agent"].isin([*METHODS])
+    learned, others = everything[of_methods], everything[~of_methods]
+    again = learned.duplicated(["row", "agent", "measure", "seed", "retraining", "setting"])
+    if again.any():
+        first = learned[again].iloc[0]
+        raise ValueError(f"two reports have seed {first['seed']:g} of {first['agent']}")
+    experts = others[others["agent"] == "expert"]
+    if (experts.groupby(["row", "measure", "setting"])["evaluation"].nunique() > 1).any():
+        raise ValueError("the reports have different experts, so their seeds do not compare")
+    place = ["row", "agent", "measure", "expert_of", "setting"]
+    return pd.concat([others.drop_duplicates(place), learned], ignore_index=True)
 
 
 def _print_imitation(name: str, seeds: pd.DataFrame) -> None:
@@ -79,4 +106,6 @@ def _print_reused(name: str, seeds: pd.DataFrame) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("report", nargs="+", type=Path, help="directory with a seeds.csv")
-    main(parser.parse_args().report)
+    parser.add_argument("--pool", action="store_true", help="the reports have other seeds each")
+    arguments = parser.parse_args()
+    main(arguments.report, arguments.pool)
