@@ -64,8 +64,7 @@ def write_stream(
         OSError: the directory cannot be written.
         UsageError: no step, too many episodes, or a true reward that only some steps have.
     """
-    # The numbers of an import rarely repeat.
-    return _write(directory, env, settings, pieces(parts, size), metadata, repeating=())
+    return _write(directory, env, settings, pieces(parts, size), metadata)
 
 
 def write_demonstrations(
@@ -84,7 +83,7 @@ def write_demonstrations(
     episodes = [(index, t) for index, (_, group) in enumerate(groups) for t in group]
     if not episodes:
         raise ValueError("no trajectory to write")
-    _write(directory, env, settings, itertools.starmap(_steps, episodes), metadata, repeating=None)
+    _write(directory, env, settings, itertools.starmap(_steps, episodes), metadata)
 
 
 def _steps(setting: int, trajectory: Trajectory) -> Steps:
@@ -110,9 +109,8 @@ def _write(
     settings: Sequence[Setting],
     parts: Iterator[Steps],
     metadata: Mapping[str, Any],
-    repeating: Sequence[str] | None,
 ) -> Written:
-    """Write each of ``parts`` as a row group; ``repeating`` as for :func:`writer`."""
+    """Write each of ``parts`` as a row group."""
     first = next(parts, None)
     if first is None:
         raise UsageError("the recordings hold no episode", "name recordings with episodes")
@@ -121,7 +119,8 @@ def _write(
     tags = file_metadata(env, metadata, schema)
     schema = schema.with_metadata(tags)
     table = _EpisodeTable(rewarded)
-    with writer(directory / STEPS, schema, repeating) as file:
+    # With dictionaries, recorded numbers take a third more bytes.
+    with writer(directory / STEPS, schema, repeating=()) as file:
         for part in itertools.chain([first], parts):
             file.write_table(table.add(schema, part), row_group_size=max(1, len(part)))
     rows = table.rows(settings, episodes_schema(width, rewarded=rewarded).with_metadata(tags))
