@@ -134,7 +134,11 @@ def _ranked(found: Assessed) -> list[str]:
 
 
 def _interval(found: Interval | None) -> str:
-    return "-" if found is None else f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+    if found is None:
+        return "-"
+    if found.low is None or found.high is None:
+        return f"{found.value:.2f}"
+    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
 
 
 def _measured(found: Measured, digits: int = 1) -> str:

@@ -216,11 +216,11 @@ class Measured(Struct, frozen=True, kw_only=True):
 
 
 class Interval(Struct, frozen=True, kw_only=True):
-    """A number and its 95 % bootstrap interval."""
+    """A number and its 95 % bootstrap interval; None with too few samples."""
 
     value: Finite
-    low: Finite
-    high: Finite
+    low: Finite | None = None
+    high: Finite | None = None
 
 
 class Agreement(Struct, frozen=True, kw_only=True):

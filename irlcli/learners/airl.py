@@ -119,7 +119,7 @@ class AIRL:
         rng = np.random.default_rng(derive("shuffled settings", seed, 0)[0])
         counts = [len(episodes) for episodes in demonstrations]
         self._groups = group(config.grouping, counts, rng)
-        self._weights = torch.tensor([g.weight for g in self._groups])
+        self._weights = torch.tensor([g.weight for g in self._groups], dtype=torch.float32)
         shape: dict[str, Any] = {
             "observation_size": observation_size,
             "action_size": actions.size,

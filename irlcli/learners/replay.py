@@ -17,9 +17,10 @@ def whole_episodes(
 ) -> tuple[Transitions, np.ndarray]:
     """A round's transitions [B] in ``worlds`` [N] bool, and the episode number [B] of each.
 
-    Episodes that the round's end may have cut are left out whole. The others are an unbiased
-    sample of the policy's: which ones they are depends only on when they start (Wald). If a round
-    is shorter than the horizon, each world's first episode is kept up to the round's end.
+    Episodes that the round's end may have cut are left out whole. Which ones are left depends only
+    on when they start, so sums over them are unbiased (Wald). Their shares are so nearly: a round
+    of many short episodes counts no more than one of few long ones. If a round is shorter than the
+    horizon, each world's first episode is kept up to the round's end.
     """
     ended = np.concatenate([r.terminated | r.truncated for r in rollouts])
     steps, count = ended.shape

@@ -155,7 +155,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "measure": measure,
                     "setting": ", ".join(row.settings_of(measure)),
                     "seeds": s.n,
-                    "seeds_wanted": len(p.seeds) if agent in p.methods else 1,
+                    "seeds_wanted": len(p.seeds) if agent in p.methods else min(1, len(planned)),
                     "mean": s.mean,
                     "deviation": s.deviation,
                     "low": low,

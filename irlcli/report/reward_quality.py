@@ -27,6 +27,8 @@ ALLOWED_REGRET = 0.1
 _RESAMPLES = 2000
 # Episodes that are resampled at a time, which bounds the memory.
 RESAMPLED_AT_ONCE = 1_000_000
+# Policies below which a correlation has no interval.
+FEWEST_RESAMPLED = 5
 
 
 class Member(NamedTuple):
@@ -158,17 +160,24 @@ def agreement(members: Sequence[Member], lower: bool = False) -> Agreement:
     point = true.mean(-1).reshape(1, -1), learned.mean(-1).reshape(1, -1)
     here = chosen(point[0], present.reshape(1, -1))
     there = chosen(draws[0], present[drawn].reshape(_RESAMPLES, -1))
+    count = int(here.reshape(shape).any(1).sum())
     return Agreement(
         policies=int(here.sum()),
-        spearman=_interval(spearman(*point, here), spearman(*draws, there)),
-        pearson=_interval(pearson(*point, here), pearson(*draws, there)),
+        spearman=_interval(spearman(*point, here), spearman(*draws, there), count),
+        pearson=_interval(pearson(*point, here), pearson(*draws, there), count),
     )
 
 
-def _interval(point: np.ndarray, draws: np.ndarray) -> Interval | None:
-    """None if undefined. A resample that is constant says nothing and is left out."""
+def _interval(point: np.ndarray, draws: np.ndarray, count: int) -> Interval | None:
+    """None if undefined. A resample that is constant says nothing and is left out.
+
+    Of few policies, those that remain have nearly all the same order: they have no interval.
+    """
     if math.isnan(point[0]):
         return None
+    if count < FEWEST_RESAMPLED:
+        return Interval(value=float(point[0]))
+
     low, high = np.nanpercentile(draws, [2.5, 97.5])
     return Interval(value=float(point[0]), low=float(low), high=float(high))
 

@@ -128,7 +128,7 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
     rank, improvement = rank_test(a, b)
     found = replace(found, rank=rank, improvement=improvement)
     if not np.ptp(a) and not np.ptp(b):
-        return replace(found, why="all seeds are equal, so the variance is zero")
+        return replace(found, why="each method's seeds are equal, so the variance is zero")
     # scipy warns if one sample is constant. The tests are defined all the same.
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         welch, student = (stats.ttest_ind(a, b, equal_var=v) for v in (False, True))

@@ -190,4 +190,4 @@ def _epic_distances(
     return found, ""
 
 
-STAGE = Stage("assess", 5, run, reads=("assessment",))
+STAGE = Stage("assess", 6, run, reads=("assessment",))

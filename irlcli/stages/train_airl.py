@@ -38,8 +38,8 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     airl: AIRLConfig
     penalty_version: int | UnsetType = UNSET
     selection_version: int | UnsetType = UNSET
-    # 2: what is left over of every setting is dealt to the same groups.
-    dealing_version: Literal[2] | UnsetType = UNSET
+    # 2: what is left over of every setting is dealt to the same groups. 3: weights in single precision.
+    shuffling_version: Literal[3] | UnsetType = UNSET
 
 
 def request(
@@ -86,7 +86,7 @@ def request(
         airl=relevant,
         penalty_version=penalty_version(relevant.penalty),
         selection_version=_selection_version(relevant),
-        dealing_version=2 if relevant.grouping == "shuffled" else UNSET,
+        shuffling_version=3 if relevant.grouping == "shuffled" else UNSET,
     )
     check_risks(relevant.penalty, relevant.grouping, trained)
     label = f"train-airl {describe(relevant)} {env} {', '.join(texts)} seed {seed}"

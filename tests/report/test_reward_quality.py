@@ -56,13 +56,14 @@ def test_absent_policies_do_not_count():
 
 
 def test_intervals_resample_episodes_and_keep_their_two_returns_together():
-    """Two policies: the correlation is 1 or -1 in each resample."""
+    """Two kinds of policies, three of each: the correlation is 1 or -1 in each resample."""
     noise = np.array([-9.0, 9.0, -8.0, 8.0])
 
     def low(true, learned):
         members = [
-            Member(f"{i}", "clone", "e", i + t, i + x, np.ones(4))
+            Member(f"{i} {copy}", "clone", "e", i + t, i + x, np.ones(4))
             for i, (t, x) in enumerate(zip(true, learned, strict=True))
+            for copy in range(3)
         ]
         return agreement(members).pearson.low
 
@@ -182,8 +183,8 @@ def test_the_interval_of_constant_episodes_is_scipys_bootstrap(seed):
 
 
 def test_a_policy_is_resampled_with_all_its_settings():
-    """Four policies, repeated in five settings, are no twenty policies."""
-    true, learned = np.array([0.0, 1.0, 2.0, 3.0]) * 100, np.array([10.0, 0.0, 30.0, 20.0])
+    """Six policies, repeated in five settings, are no thirty policies."""
+    true, learned = 100 * np.arange(6.0), np.array([10.0, 0.0, 30.0, 20.0, 50.0, 40.0])
     once = agreement(bank(true, learned)).pearson
     repeated = agreement(
         [
@@ -194,6 +195,20 @@ def test_a_policy_is_resampled_with_all_its_settings():
     ).pearson
     assert repeated.value == pytest.approx(once.value)
     assert repeated.low == pytest.approx(once.low, abs=0.05)
+
+
+@pytest.mark.parametrize(("policies", "known"), [(3, False), (4, False), (5, True)])
+def test_few_policies_have_no_interval(policies, known):
+    """Of three, resamples that are not constant have two or three points: nearly all have +-1."""
+    found = agreement(
+        [
+            member(f"policy {i}", t, t, setting=f"e{s}")
+            for i, t in enumerate(range(policies))
+            for s in range(3)
+        ]
+    )
+    assert found.spearman.value == pytest.approx(1.0)
+    assert (found.spearman.low is not None) is known
 
 
 def test_the_return_distance_of_equal_and_of_opposite_rewards():
