@@ -48,6 +48,12 @@ def test_policies_that_were_retrained_differently_have_different_labels():
         assert how in labels.describe(record) and how in name
 
 
+def test_a_student_is_not_zero_shot_where_its_round_was_selected():
+    student = Subject(agent="student", env="ant", settings=("mass=1x",), selected_in="mass=2x")
+    names = [agent_name(student, f"mass={value}") for value in ("1x", "2x", "3x")]
+    assert all_differ(names) and [("zero-shot" in name) for name in names] == [False, False, True]
+
+
 def test_the_label_of_an_evaluation_tells_how_its_policy_was_retrained():
     plain, bounded = transfer(), transfer(ceiling=0.9)
     score = KeyRecord("evaluate", 1, {"env": "ant", "settings": ["mass=4x"]}, {"policy": "p"})

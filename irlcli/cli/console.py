@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 JSON_VERSION = 1
 _PLAIN_SECONDS = 10.0
 _MAX_MESSAGE, _MAX_HINT = 900, 4000
+_MAX_RUN_NAME = 150
 # Printed text may come from a file. It must not control the terminal or fake a second line.
 _CONTROLS = dict.fromkeys(
     [*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)], "?"
@@ -61,6 +62,8 @@ class TerminalConsole:
         self._pace, self._printed = Pace(), 0.0
         self._tensorboard = tensorboard
         self._writer: Any = None
+        #: Whether anything was written for TensorBoard.
+        self.wrote_scalars = False
         if tensorboard is not None:
             _require_tensorboard()
         #: Whether a live display can be drawn.
@@ -92,7 +95,10 @@ class TerminalConsole:
         if self._tensorboard is None:
             return
         if self._writer is None:
-            directory = f"{self._label} {self._key[:8]}".replace(" ", "_").replace(",", "")
+            # File systems limit a name, mostly to 255 bytes; the key tells equal beginnings apart.
+            name = f"{self._label[:_MAX_RUN_NAME]} {self._key[:8]}"
+            directory = name.replace(" ", "_").replace(",", "")
+            self.wrote_scalars = True
             from torch.utils.tensorboard import SummaryWriter
 
             self._writer = SummaryWriter(str(self._tensorboard / directory))
@@ -140,10 +146,12 @@ class TerminalConsole:
                 TextColumn(
                     "{task.fields[detail]}",
                     markup=False,
-                    table_column=Column(no_wrap=True, overflow="ellipsis"),
+                    table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"),
                 ),
                 console=Console(stderr=True),
                 transient=True,
+                # On a narrow terminal only the detail shrinks.
+                expand=True,
             )
             self._task = self._live.add_task("", total=total, detail=detail)
             self._live.start()

@@ -81,10 +81,11 @@ class LiveJobs(PlainJobs):
             TextColumn(
                 "{task.fields[detail]}",
                 markup=False,
-                table_column=Column(no_wrap=True, overflow="ellipsis"),
+                table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"),
             ),
             console=Console(stderr=True),
             transient=True,
+            expand=True,
         )
         self._bars: dict[str, Any] = {}
 

@@ -158,6 +158,8 @@ class StageSession(base.StageSession):
             self.print_plan([step for request in requests for step in runner.plan(request)])
             return []
         artefacts = self.run(requests, name)
+        if self.tensorboard is not None and not self.console.wrote_scalars:
+            self.console.warn(f"nothing was trained, so nothing was written to {self.tensorboard}")
         for artefact in artefacts:
             self.print_artefact(artefact, name, details)
         return artefacts

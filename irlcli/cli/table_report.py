@@ -80,8 +80,8 @@ def check_out(directory: Path, store: Path, table: "Table") -> None:
     numbers = directory / f"{table.name if table.kind == 'comparison' else table.kind}.csv"
     if (directory / "README.md").exists() and not numbers.exists():
         raise UsageError(
-            f"--out {directory} has a README.md that is not from a report on {table.name}",
-            f"name another directory: {numbers.name} would lie beside the README.md of such a report",
+            f"--out {directory} has a README.md but no {numbers.name}, so it holds no report on {table.name}",
+            "name another directory",
         )
 
 

@@ -310,6 +310,12 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     select_every: Count = 10
     select_episodes: Count = 10
     challenger: ChallengerConfig = ChallengerConfig()
+
+    @property
+    def selecting_setting(self) -> str | None:
+        """The setting in which the round that is kept earns most, if one selects."""
+        return None if self.select in ("last", "episodes") else self.select
+
     ppo: PPOConfig = PPOConfig()
     dropout: Dropout | UnsetType = UNSET
     columns: Columns | UnsetType = UNSET

@@ -96,6 +96,11 @@ class Reward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
         """How it was learned."""
         return RewardOrigin(method=self.method, seed=self.seed, settings=self.settings)
 
+    @property
+    def selected_in(self) -> str | None:
+        """The setting whose true return chose the round, if one did."""
+        return self.airl.selecting_setting
+
 
 class TabularReward(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``reward.json`` of train-maxent, and the description inside its ``reward.pt``."""
@@ -129,7 +134,8 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     ``settings`` are those the policy was trained in. A retrained policy also names the reward it
     was trained on (``method``, ``reward_seed``, ``reward_settings``) and how it was trained:
     by which algorithm, under which ceiling, whether it began as that reward's student, and, with
-    ``transfer.restarts``, what each restart earned of the learned reward.
+    ``transfer.restarts``, what each restart earned of the learned reward. ``selected_in`` is the
+    setting whose true return chose a student's round.
     """
 
     agent: Agent
@@ -144,6 +150,7 @@ class Policy(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     ceiling: Quantile | None = None
     from_student: bool = False
     restarts: tuple[Finite, ...] = ()
+    selected_in: str | None = None
 
 
 class EnvironmentName(Struct, frozen=True, kw_only=True):
@@ -177,6 +184,7 @@ class Subject(Struct, frozen=True, kw_only=True):
     ceiling: Quantile | None = None
     from_student: bool = False
     restarts: tuple[Finite, ...] = ()
+    selected_in: str | None = None
 
     @property
     def learning_seed(self) -> int | None:

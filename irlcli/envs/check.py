@@ -89,14 +89,17 @@ def _plain(message: BaseException) -> str:
 
 
 def _ends(knob: Knob) -> list[Value]:
-    """The smallest and the largest value of a knob, in its usual form."""
-    match knob.forms[0]:
-        case "triple":
-            return [Value("triple", (x, x, x)) for x in (knob.low, knob.high)]
-        case "range":
-            return [Value("range", (knob.low, knob.high))]
-        case form:
-            return [Value(form, (x,)) for x in (knob.low, knob.high)]
+    """The smallest and the largest value of a knob, in each of its forms."""
+    found: list[Value] = []
+    for form in knob.forms:
+        match form:
+            case "triple":
+                found += [Value("triple", (x, x, x)) for x in (knob.low, knob.high)]
+            case "range":
+                found.append(Value("range", (knob.low, knob.high)))
+            case _:
+                found += [Value(form, (x,)) for x in (knob.low, knob.high)]
+    return found
 
 
 def _episode(spec: EnvironmentSpec, setting: Setting) -> np.ndarray:

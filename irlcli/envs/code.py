@@ -70,7 +70,7 @@ def _origin(module: str, directory: Path | None, where: str) -> Path:
     top, *inner = module.split(".")
     hint = "install it, or add its directory to PYTHONPATH"
     if directory is None:
-        hint += ". Or name the TOML file beside it: --env, in Python env="
+        hint += ". Or name the TOML file that lies beside it, with --env"
     else:
         hint += f", or put {top}.py beside the TOML file"
     try:

@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypedDict, TypeVar
 
 from irlcli.configs.fields import MAX_COUNT
 from irlcli.configs.load import field_of
-from irlcli.errors import IrlError, UsageError, file_failure, suggest
+from irlcli.errors import IrlError, UsageError, file_failure, first_line, suggest
 from irlcli.requests.in_python import in_python
 
 Overrides = Mapping[str, Any] | Sequence[str]
@@ -134,9 +134,19 @@ def words(command: str, options: Mapping[str, Any], *arguments: str) -> list[str
 
 
 def overrides(given: Overrides) -> list[str]:
-    """As for ``--set``: each ``FIELD=VALUE``."""
+    """As for ``--set``: each ``FIELD=VALUE``.
+
+    Raises:
+        UsageError: something else than text, or a list of something else than numbers and text.
+    """
     if isinstance(given, Mapping):
-        return [f"{field}={_toml(value)}" for field, value in given.items()]
+        try:
+            return [f"{field}={_toml(value)}" for field, value in given.items()]
+        except TypeError as error:
+            # From JSON, of an element in a list.
+            raise UsageError(
+                f"set: {first_line(error)}", "give numbers, text or lists of them"
+            ) from None
     return texts("set", given)
 
 
@@ -157,8 +167,8 @@ def _toml(value: Any) -> str:
 
 
 def _element(value: Any) -> str:
-    """``value`` in a list of TOML. A scalar of NumPy is the number that it holds."""
-    return json.dumps(value.item() if hasattr(value, "item") else value)
+    """``value`` in a list of TOML. What NumPy holds is Python's own values."""
+    return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
 
 
 def texts(name: str, given: Any) -> list[str]:
@@ -199,7 +209,7 @@ def number(name: str, given: float | None) -> float | None:
     try:
         return None if given is None else float(given)
     except OverflowError:
-        raise UsageError(f"{name} is too large for a number", f"write {name}=1.0") from None
+        raise UsageError(f"{name} is too large for a float", f"write {name}=1.0") from None
 
 
 def whole(name: str, given: int, least: int = 0) -> int:

@@ -73,7 +73,8 @@ class Lab:
         wait: bool = True,
         quiet: bool = False,
     ):
-        self.store = Path(store)
+        # A notebook may change its working directory.
+        self.store = Path(store).absolute()
         self.profile = profile
         self.settings = settings
         self.set = overrides(set)

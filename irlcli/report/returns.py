@@ -185,7 +185,8 @@ def agent_name(policy: Subject, setting: str) -> str:
 
     ``expert``, ``expert of bounce=0.1`` where that is another setting, ``random``, ``idle``,
     ``AIRL-IRM retrained policy``, ``AIRL-IRM student, zero-shot``, or ``AIRL-IRM student, in
-    distribution`` where its demonstrations cover the setting.
+    distribution`` where its demonstrations cover the setting, and ``AIRL-IRM student, where its
+    round was selected`` in the setting whose true return did so.
     """
     agent = policy.agent
     if agent == "expert" and policy.settings and setting not in policy.settings:
@@ -198,6 +199,8 @@ def agent_name(policy: Subject, setting: str) -> str:
         return f"{method} retrained policy" + (f" {how}" if how else "")
     if agent == "student":
         demonstrated = (parse_setting(policy.env, text) for text in policy.settings)
-        seen = any(covers(s, parse_setting(policy.env, setting)) for s in demonstrated)
-        return f"{method} student, {'in distribution' if seen else 'zero-shot'}"
+        if any(covers(s, parse_setting(policy.env, setting)) for s in demonstrated):
+            return f"{method} student, in distribution"
+        selected = setting == policy.selected_in
+        return f"{method} student, {'where its round was selected' if selected else 'zero-shot'}"
     return agent

@@ -62,6 +62,18 @@ class Where(NamedTuple):
         check_distinct("the command", settings)
         return settings
 
+    def check_ordered(self, what: str) -> None:
+        """Refuse options whose settings have no order among them, where ``what`` needs one.
+
+        Raises:
+            UsageError: ``--intervention`` and ``--setting`` are both given.
+        """
+        if self.text is not None and self.several:
+            raise UsageError(
+                f"{what} follow the order of the settings, but --intervention and --setting have none",
+                "name every setting by --setting, in that order",
+            )
+
 
 def where(ood: str | None, intervention: str | None, several: Sequence[str]) -> Where:
     """The settings that the options name.
@@ -112,7 +124,7 @@ def named_settings(
         raise UsageError(
             f"the settings of {env} list no values of {text!r}", f"write {text}=VALUE,VALUE"
         )
-    knobs = parse_setting(env, origin.settings[0]).knobs
+    knobs = {knob for other in origin.settings for knob in parse_setting(env, other).knobs}
     if len(knobs) != 1:
         hint = "write KNOB=VALUE, or --setting KNOB=VALUE,KNOB=VALUE"
         raise UsageError(f"{text!r} names no intervention", hint)
@@ -132,11 +144,16 @@ def named_settings(
 def warn_of_seen(
     console: "RunConsole", settings: Sequence[Setting], origin: "Reward | Policy", ref: str
 ) -> None:
-    """Warn of each ``--ood`` setting that ``origin``, which ``ref`` names, was trained in."""
+    """Warn of each ``--ood`` setting that ``origin``, which ``ref`` names, has seen."""
     trained = [parse_setting(origin.env, text) for text in origin.settings]
+    selected = origin.selected_in
     for setting in settings:
-        if any(overlap(setting, other) for other in trained):
+        if setting in trained:
             console.warn(f"{setting} is not held out: {ref!r} was trained in it")
+        elif seen := [other for other in trained if overlap(setting, other)]:
+            console.warn(f"{setting} is not held out: {ref!r} was trained in {seen[0]}")
+        elif selected and overlap(setting, parse_setting(origin.env, selected)):
+            console.warn(f"{setting} is not held out: it selected the round of {ref!r}")
 
 
 def _listed(config: "Config", knob: str, kind: Literal["id", "ood"]) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.experiments import bank, references
-from irlcli.interventions import Setting, parse_setting
+from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import assess as stage
@@ -58,7 +58,7 @@ def assess(
     finder = bank.Finder(session.store, session.runner().lookup(), config)
     shown, cloned = finder.demonstrations(source), origin.settings
     if demos is not None:
-        shown, cloned = _given(session, demos, origin.env)
+        shown, cloned = _given(session, demos, origin.env, origin.settings)
     policies = finder.policies(source, origin, settings, shown, cloned, seed)
     if shown is None:
         session.console.warn(
@@ -89,13 +89,16 @@ def _file(env: str) -> str | None:
     return None if own is None or own.directory is None else own.source
 
 
-def _given(session: StageSession, demos: str, env: str) -> "tuple[Source, tuple[str, ...]]":
+def _given(
+    session: StageSession, demos: str, env: str, learned: Sequence[str]
+) -> "tuple[Source, tuple[str, ...]]":
     source, of, settings = references.demonstrations(session.store, demos)
     if of != env:
         raise UsageError(
             f"{demos!r} are demonstrations of {of}, not of {env}",
             "name demonstrations of the reward's environment",
         )
+    check_observed(env, learned, [parse_setting(env, text) for text in settings])
     return source, tuple(settings)
 
 

@@ -48,10 +48,13 @@ def collect_experts(
     if trust and not expert:
         raise UsageError("--trust needs --expert, whose files it is about", "omit --trust")
     config = session.config(env)
-    settings = arguments.where(None, intervention, setting).settings(env, config)
+    where = arguments.where(None, intervention, setting)
+    settings = where.settings(env, config)
     counts: Sequence[int] = ()
     if episodes is not None:
         counts = arguments.counts(episodes)
+        if len(counts) > 1:
+            where.check_ordered("several --episodes")
         if any(field_of(item) == "demonstrations.episodes" for item in session.overrides):
             raise UsageError(
                 "--episodes and --set demonstrations.episodes are both given", "omit one of them"
@@ -132,6 +135,9 @@ def import_demonstrations(
     for source in recordings:
         check_path(Path(source), "SOURCE")
     env = resolve(env).name
-    settings = arguments.where(None, intervention, setting).settings(env, session.config(env))
+    where = arguments.where(None, intervention, setting)
+    settings = where.settings(env, session.config(env))
     form, found = recorded(recordings)
+    if len(found) > 1 and setting_column is None:
+        where.check_ordered("several SOURCES")
     return import_stage.request(form, found, env, settings, setting_column, cut)

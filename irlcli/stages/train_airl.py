@@ -133,8 +133,10 @@ def reward_label(airl: AIRLConfig, seed: int) -> str:
 
 
 def _selection_version(airl: AIRLConfig) -> int | UnsetType:
-    """In keys where a round is selected from those with a penalty."""
-    # 2: none is selected before lambda has its full value.
+    """In keys where a round is selected by a setting, or from rounds with a penalty."""
+    # 2: none is selected before lambda has its full value. 3: the student knows the setting.
+    if airl.selecting_setting is not None:
+        return 3
     return 2 if airl.select != "last" and airl.penalty != "none" else UNSET
 
 
@@ -237,7 +239,14 @@ def run(job: Job) -> None:
         "method": method_of(airl),
         "seed": p.seed,
     }
-    write_policy(job.output, trainer.policy, airl.ppo, agent="student", **origin)
+    write_policy(
+        job.output,
+        trainer.policy,
+        airl.ppo,
+        agent="student",
+        selected_in=airl.selecting_setting,
+        **origin,
+    )
     selected = None
     if selector is not None:
         selected = Selected(round=selector.best["round"], score=selector.best["score"])

@@ -62,6 +62,31 @@ def test_an_end_that_is_cut_off_is_no_termination(irl, tmp_path, beyond):
     assert ("episodes are terminated" in done.err) == (beyond == 0)
 
 
+def test_sources_and_counts_need_an_order_of_their_settings(irl, tmp_path):
+    """The options do not say whether the setting of --setting or of --intervention comes first."""
+    both = ["--env", "lunar-lander", "--setting", "default", "--intervention", "engine-power=2x"]
+    for file in ("a.parquet", "b.parquet"):
+        pq.write_table(pa.table({"reward": [0.0]}), tmp_path / file)
+    sources = [tmp_path / "a.parquet", tmp_path / "b.parquet"]
+    store = ["--store", tmp_path / "runs"]
+    assert_answered(irl("import", *sources, *both, *store), 2, "order of the settings")
+    line = ["collect-experts", *both, "--episodes", "1,3", *store]
+    assert_answered(irl(*line), 2, "order of the settings")
+
+
+def test_a_dataset_of_minari_names_only_an_environment_that_makes_it(irl, tmp_path, minari):
+    """Gymnasium would make the grid of the default size."""
+    store = ["--store", tmp_path / "runs", "--profile", "smoke"]
+    grid = ["--set", "gridworld.size=6", "--episodes", "1", "--name", "grid"]
+    made = irl(
+        "collect-experts", "--env", "gridworld", "--intervention", "path-group", *grid, *store
+    )
+    assert made.code == 0, made.err
+    done = irl("export", "demos", "grid", "--to", "minari:me/grid-v0", *store[:2])
+    assert done.code == 0, done.err
+    assert minari.load_dataset("me/grid-v0").env_spec is None
+
+
 def test_lineage_names_the_recording_that_was_used(irl, store_copy, exported, tmp_path):
     """Other files may hold the same episodes."""
     used = imported(irl, store_copy, exported, *LANDER)

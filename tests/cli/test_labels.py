@@ -212,6 +212,23 @@ def test_a_missing_tensorboard_is_reported_before_training(monkeypatch, irl, sto
         console.TerminalConsole(tensorboard=tmp_path)
 
 
+def test_tensorboard_is_told_of_a_training_with_a_long_label(tmp_path):
+    pytest.importorskip("tensorboard")
+    terminal = console.TerminalConsole(quiet=True, tensorboard=tmp_path)
+    for key in ("a" * 64, "b" * 64):
+        terminal.start("train-airl ant " + ", ".join(f"mass={i}x" for i in range(200)), False, key)
+        terminal.scalars(1, {"return": 1.0})
+        terminal.close()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_command_that_trains_nothing_says_that_tensorboard_has_nothing(irl, tmp_path):
+    pytest.importorskip("tensorboard")
+    line = ["evaluate", "--idle", "--env", "lunar-lander", "--setting", "default", *SMOKE]
+    done = irl(*line, "--store", tmp_path / "runs", "--tensorboard", tmp_path / "logs")
+    assert done.code == 0 and f"nothing was written to {tmp_path / 'logs'}" in done.err
+
+
 def test_show_names_libraries_that_have_changed_since(irl, smoke_store, monkeypatch):
     line = ["show", "airl", "--store", smoke_store.path]
     same = irl(*line, "--json")

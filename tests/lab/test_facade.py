@@ -94,6 +94,27 @@ def test_every_option_of_a_command_is_an_argument(command):
     assert arguments == {option.name for option in found.params} - general
 
 
+def test_a_lab_keeps_its_store_when_the_working_directory_changes(
+    store_copy, monkeypatch, tmp_path
+):
+    monkeypatch.chdir(store_copy.path.parent)
+    lab = irlcli.Lab(store_copy.path.name, profile="smoke")
+    monkeypatch.chdir(tmp_path)
+    assert lab.artefact("airl").id == store_copy.airl
+    assert len(lab.artefact("demos").to_pandas())
+
+
+def test_a_path_with_two_dashes_is_named_as_it_is(lab):
+    with pytest.raises(NotFound, match=r"/data/run--old/a--b\.parquet"):
+        lab.import_demonstrations("/data/run--old/a--b.parquet", "lunar-lander", "bounce=0.1")
+
+
+@pytest.mark.parametrize("widths", [[np.array([8, 8])], [object()], [{8}]])
+def test_a_list_of_something_else_than_numbers_is_refused(lab, widths):
+    with pytest.raises(UsageError):
+        lab.train_airl("demos", method="irm", set={"airl.hidden": widths})
+
+
 def test_a_recorded_command_says_what_a_call_turned_off():
     assert words("train-airl", {"state_only": False}) == ["irl", "train-airl", "--no-state-only"]
     assert words("collect-experts", {"trust": False}) == ["irl", "collect-experts"]

@@ -558,3 +558,11 @@ def test_a_step_that_returns_something_else(bench, returned, said):
     bench.edit(bench.module, old, returned)
     done = bench.irl(*RANDOM, *ONE)
     assert done.code == 1 and said in done.err, done.err
+
+
+def test_every_form_of_a_knob_is_made_at_its_bounds(bench):
+    """The cart's constructor takes a number; a range gives it two."""
+    forms = 'argument = "drag"\nforms = ["absolute"'
+    bench.edit(bench.toml, forms, forms + ', "range"')
+    done = bench.irl("envs", "check", "cart.toml")
+    assert done.code == 1 and "FAIL  drag: its bounds can be made" in done.out, done.out

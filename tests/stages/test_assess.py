@@ -312,3 +312,12 @@ def test_tabular_rewards_are_refused(irl, tmp_path):
     irl("train-maxent", "--demos", "d", "--method", "erm", *common, "--name", "maxent")
     done = irl("assess", "maxent", *common)
     assert done.code == 2 and "MaxEnt IRL" in done.err and "hint:" in done.err
+
+
+def test_demonstrations_with_other_observations_are_refused_before_the_clone(irl, store_copy):
+    common = ["--store", store_copy.path, *SMOKE]
+    cue = ["--env", "lunar-lander", "--intervention", "cue-strength=0.9,0.8", "--episodes", "1"]
+    assert irl("collect-experts", *cue, *common, "--name", "cue").code == 0
+    done = irl("assess", "airl", "--demos", "cue", *common)
+    assert (done.code, done.out) == (2, "") and "different observations" in done.err
+    assert "hint:" in done.err

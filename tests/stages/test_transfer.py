@@ -11,10 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from irlcli.configs import load_config
 from irlcli.data.tensors import load_policy_file, load_reward_file
+from irlcli.errors import UsageError
 from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
-from irlcli.requests.arguments import warn_of_seen
+from irlcli.requests.arguments import warn_of_seen, where
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
 from irlcli.rl.sac import SACTrainer
@@ -217,7 +219,7 @@ def test_a_training_setting_is_named_as_for_evaluations(runs, irl):
     ],
 )
 def test_a_held_out_setting_that_shares_worlds_with_a_trained_one_is_named(trained, shared, apart):
-    origin = SimpleNamespace(env="half-cheetah", settings=(trained,))
+    origin = SimpleNamespace(env="half-cheetah", settings=(trained,), selected_in=None)
 
     def named(text):
         said = []
@@ -230,6 +232,27 @@ def test_a_held_out_setting_that_shares_worlds_with_a_trained_one_is_named(train
         return [f"{knob}={value}" for value in values.split(",")]
 
     assert named(shared) == texts(shared) and named(apart) == []
+
+
+def test_a_setting_that_selected_the_round_is_not_held_out():
+    one = SimpleNamespace(env="ant", settings=("mass=1x",), selected_in="mass=2x")
+    said = []
+    settings = [parse_setting("ant", text) for text in ("mass=2x", "mass=3x")]
+    warn_of_seen(SimpleNamespace(warn=said.append), settings, one, "irm")
+    assert said == ["mass=2x is not held out: it selected the round of 'irm'"]
+
+
+@pytest.mark.parametrize("settings", [("default", "mass=2x"), ("mass=2x", "default")])
+def test_values_alone_belong_to_the_only_knob_of_all_training_settings(settings):
+    origin = SimpleNamespace(env="ant", settings=settings)
+    (found,) = where("3x", None, ()).settings("ant", load_config("ant", "smoke"), origin)
+    assert str(found) == "mass=3x"
+
+
+def test_values_alone_are_refused_where_the_training_settings_have_several_knobs():
+    origin = SimpleNamespace(env="ant", settings=("mass=2x", "friction=1:1:1"))
+    with pytest.raises(UsageError, match="names no intervention"):
+        where("3x", None, ()).settings("ant", load_config("ant", "smoke"), origin)
 
 
 def test_bad_input_is_one_line_and_a_hint(runs, irl, store_copy):

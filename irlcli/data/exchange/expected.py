@@ -61,8 +61,8 @@ class Expected:
                     return index
         raise UsageError(
             f"{place}: setting {text[:80]!r} is not one of {', '.join(self.settings)}",
-            "correct the source (a multiplier is written as 2x), or name every setting of it by "
-            "--intervention or --setting",
+            "correct the source (a multiplier is written as 2x), or name all settings that it holds "
+            "with --intervention or --setting",
         )
 
     def _meant(self, text: str) -> Iterator[Setting]:

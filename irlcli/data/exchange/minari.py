@@ -19,6 +19,7 @@ from irlcli.data.exchange.expected import (
 )
 from irlcli.data.steps import PIECE, Steps, episodes
 from irlcli.envs.registry import environment
+from irlcli.envs.spec import EnvironmentSpec
 from irlcli.errors import IntegrityError, StageFailed, UsageError
 from irlcli.interventions import Setting
 from irlcli.store import read_json
@@ -225,7 +226,6 @@ def write_minari(
         OSError: the directory cannot be written.
     """
     storage_class = _storage_class()
-    from gymnasium import registry
     from minari import __version__
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
@@ -255,7 +255,7 @@ def write_minari(
             )
 
     storage = storage_class.new(
-        directory, *spaces, env_spec=registry.get(environment(env).gym_id), data_format="hdf5"
+        directory, *spaces, env_spec=_registered(environment(env)), data_format="hdf5"
     )
     storage.update_episodes(buffers())
     texts, numbers = [str(s) for s in settings], [intervention_numbers(s) for s in settings]
@@ -269,6 +269,18 @@ def write_minari(
             "description": f"Demonstrations of {env} in {', '.join(texts)}.",
         }
     )
+
+
+def _registered(spec: EnvironmentSpec) -> gymnasium.envs.registration.EnvSpec | None:
+    """Gymnasium's description of the environment; None where that makes another one.
+
+    A grid's size and horizon are in its demonstrations, and one's own environment may have
+    arguments and a time limit of its own.
+    """
+    found = gymnasium.registry.get(spec.gym_id)
+    if spec.tabular or found is None or (spec.own is not None and spec.own.arguments):
+        return None
+    return found if found.max_episode_steps == spec.max_episode_steps else None
 
 
 def declare_namespace(dataset: str) -> None:
