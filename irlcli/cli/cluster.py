@@ -276,8 +276,8 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
 
     queue = _queue_of(session, plan, options)
     there = queued(plan, queue, session.store)
-    # Of each step's last job.
-    last = {job.name: r for r in records(session.store, queue.place) for job in r.jobs}
+    # Of the last job of each request.
+    last = {job.identity: r for r in records(session.store, queue.place) for job in r.jobs}
     lines: list[dict[str, str | None]] = []
     exist = 0
     for name in plan.tasks:
@@ -290,7 +290,8 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
             why = f"job {there[name].job} {place}"
             lines.append({"name": name, "state": state, "job": there[name].job, "why": why})
             continue
-        failure = last[name].failure(name) if name in last else None
+        of = last.get(plan.identities[name]) if step.status == "RUN" else None
+        failure = None if of is None else of.failure(name)
         if failure is not None:
             lines.append({"name": name, "state": "FAILED", "job": None, "why": failure.message})
         else:
@@ -301,7 +302,9 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
     for line in lines:
         out.print_data(f"{line['state']:11}{line['name']}: {line['why']}")
     jobs = sum(line["job"] is not None for line in lines)
-    out.print_note(f"{exist} of {len(plan.tasks)} steps exist, {jobs} have a job")
+    out.print_note(
+        f"{exist} of {len(plan.tasks)} steps exist, {jobs} {'has' if jobs == 1 else 'have'} a job"
+    )
 
 
 def cancel(session: StageSession, plan: "Plan", options: ClusterOptions) -> None:

@@ -210,7 +210,13 @@ def _write(text: str, stream: TextIO) -> None:
     try:
         print(text, file=stream, flush=True)
     except BrokenPipeError:
-        hang_up()
+        from irlcli.experiments.signals import stop_requested
+
+        if stream is sys.stderr and stop_requested():
+            # Its reader died of the same Ctrl-C. The checkpoint is still to be written.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        else:
+            hang_up()
 
 
 def counted(number: int, noun: str) -> str:

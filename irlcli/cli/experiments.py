@@ -141,6 +141,12 @@ def run(
     choose_penalty: ChoosePenalty = None,
     until: _Until = None,
     only: _Only = None,
+    expect: Annotated[
+        str | None,
+        typer.Option(
+            hidden=True, help="Digest of the request that --only had when it was planned."
+        ),
+    ] = None,
     tag: _Tag = None,
     experiments: TableFile = None,
     directory: Out = None,
@@ -222,6 +228,9 @@ def run(
         cancel=cancel,
     )
     options.check(choice, directory, session.dry_run)
+    if expect is not None:
+        # The command that an artefact records is to make it at any time.
+        session.command = [word for word in session.command if word not in ("--expect", expect)]
     runner = session.runner()
     plan = open_plan(session, choice)
     check_tag(session, choice, plan.table)
@@ -236,13 +245,19 @@ def run(
     runner.store.create()
     with session.reading():
         if only is not None:
+            if expect not in (None, plan.identities[only]):
+                raise UsageError(
+                    f"what {only} is made from has changed since the run was planned: its settings, "
+                    "its table or the program",
+                    "run the same command again, with another --tag where the values differ",
+                )
             _make_one(session, runner, plan, only)
             return
         warn_of_damage(plan, session.console.warn)
         if cluster is None:
             outcome = _make_all(session, runner, plan, choice, jobs or 1)
         else:
-            command = _step_command(session, choice, plan, *_PROCESS)
+            command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
             ended = cluster_jobs.run_jobs(session, runner, plan, command, options)
             if ended is None:
                 return
@@ -282,7 +297,7 @@ def _make_all(
     from irlcli.cli.jobs import job_display
     from irlcli.experiments.execute import Execution
 
-    command = _step_command(session, choice, plan, *_PROCESS)
+    command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
     display = job_display(session.console)
     try:
         return Execution(plan, runner, command, jobs, display).run()
@@ -297,6 +312,16 @@ def _step_command(
     words = [*session.config_words(), *choice.words(), "--tag", plan.selection.tag]
     words += session.place_words()
     return lambda name: [*program, "run", choice.table, "--only", name, *words]
+
+
+def _expecting(plan: "Plan", command: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
+    """``command`` with the digest of the step's request: files may change before the step starts.
+
+    With a lambda to choose, later requests are not known before the choice.
+    """
+    if plan.selection.candidates:
+        return command
+    return lambda name: [*command(name), "--expect", plan.identities[name]]
 
 
 def _report(
@@ -345,7 +370,9 @@ def _raise_for(outcome: "Outcome", plan: "Plan", continue_hint: str) -> None:
     else:
         names = ", ".join(list(outcome.failed)[:3])
         names += f" and {len(outcome.failed) - 3} more" if len(outcome.failed) > 3 else ""
-        waiting = f"; {len(outcome.blocked)} wait for them" if outcome.blocked else ""
+        them = "it" if len(outcome.failed) == 1 else "them"
+        verb = "waits" if len(outcome.blocked) == 1 else "wait"
+        waiting = f"; {len(outcome.blocked)} {verb} for {them}" if outcome.blocked else ""
         again = "run the same command again: finished steps are kept"
         error = StageFailed(
             f"{len(outcome.failed)} of {total} steps failed: {names}{waiting}",

@@ -110,7 +110,8 @@ class _Child:
         if at_once:
             os.killpg(self.process.pid, signal.SIGKILL)
         else:
-            self.process.send_signal(signal.SIGTERM)
+            # SIGTERM may reach the whole process tree: the step counts this signal and one of them once.
+            self.process.send_signal(signal.SIGUSR2)
 
     def failure(self) -> Failure:
         """Why it failed, after its end."""
@@ -265,7 +266,7 @@ class Execution:
             pass
 
     def _stop(self) -> None:
-        """Forward a signal to every process: SIGTERM for the first one, SIGKILL for the second."""
+        """Forward a signal to every process: SIGUSR2 for the first one, SIGKILL for the second."""
         if not self._passed_on:
             self._display.stopping()
         for child in self._running.values():

@@ -5,6 +5,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+_stop = threading.Event()
+
+
+def stop_requested() -> bool:
+    """Whether a signal has asked to stop since :func:`stop_requests` was last entered."""
+    return _stop.is_set()
+
 
 @contextmanager
 def stop_requests(handle: Callable[[], None]) -> Iterator[None]:
@@ -21,8 +28,10 @@ def stop_requests(handle: Callable[[], None]) -> Iterator[None]:
         yield
         return
     asked: list[int] = []
+    _stop.clear()
 
     def receive(number: int, _: object) -> None:
+        _stop.set()
         first = not asked
         again = number != signal.SIGUSR2 and any(n != signal.SIGUSR2 for n in asked)
         asked.append(number)

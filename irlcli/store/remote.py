@@ -88,7 +88,9 @@ class Remote:
         """Whether there is a store at the URL."""
         return self._layout.marker.exists()
 
-    def in_use(self) -> AbstractContextManager[None]:
+    def in_use(
+        self, wait: bool = False, on_wait: Callable[[str], None] | None = None
+    ) -> AbstractContextManager[None]:
         """Nothing: no ``gc`` runs there."""
         return nullcontext()
 

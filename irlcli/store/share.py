@@ -64,7 +64,11 @@ def share(
     """
     wanted = _with_ancestors(source, artefacts, warn, partial)
     target.create()
-    with target.in_use():
+
+    def wait_for(holder: str) -> None:
+        warn(f"waiting for {holder}, which removes artefacts of {target.root}")
+
+    with target.in_use(wait=True, on_wait=wait_for):
         # Asked once: in a bucket, each question is a request.
         there = set(target.ids())
         held = {a.id for a in wanted if a.id in there and target.holds(a)}

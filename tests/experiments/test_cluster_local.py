@@ -14,7 +14,7 @@ import pytest
 from test_run import REWARDS, ROW, Runs, alive
 
 from irlcli.experiments.cluster.local import Local
-from irlcli.experiments.cluster.records import Submitted, ended, new_record
+from irlcli.experiments.cluster.records import LOCK, Submitted, ended, new_record
 from irlcli.store import Store
 
 pytest.importorskip("submitit")
@@ -68,13 +68,30 @@ def test_another_run_sees_a_job_from_its_start_to_its_end(tmp_path):
     for _ in range(20):
         record = new_record(store, queue.place)
         line = [sys.executable, "-S", "-c", "import sys; sys.stdin.read()", "submitit.local"]
-        process = subprocess.Popen(line, stdin=subprocess.PIPE)
+        process = subprocess.Popen([*line, str(record.logs)], stdin=subprocess.PIPE)
         record.add([Submitted("step", "identity", str(process.pid))])
         assert str(process.pid) in queue.states()
         process.stdin.close()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         assert queue.states() == {}
         process.wait()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_job_of_another_store_with_the_same_process_id_is_neither_seen_nor_cancelled(tmp_path):
+    """After a restart of the machine, ids of processes begin anew."""
+    store = Store(tmp_path)
+    store.create()
+    queue = Local(store, None)
+    line = [sys.executable, "-S", "-c", "import sys; sys.stdin.read()", "submitit.local", "/other"]
+    with subprocess.Popen(line, stdin=subprocess.PIPE) as process:
+        while b"submitit" not in Path(f"/proc/{process.pid}/cmdline").read_bytes():
+            time.sleep(0.01)
+        new_record(store, queue.place).add([Submitted("step", "identity", str(process.pid))])
+        assert queue.states() == {}
+        queue.cancel([str(process.pid)])
+        time.sleep(0.1)
+        assert process.poll() is None
 
 
 def test_gc_keeps_submissions_that_have_a_job_or_a_queue_it_cannot_ask(tmp_path, monkeypatch):
@@ -193,11 +210,12 @@ def test_a_warned_job_saves_a_checkpoint_and_has_another_turn(plain, runs, tmp_p
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_ctrl_c_stops_the_jobs_at_a_checkpoint(irl, runs, tmp_path, monkeypatch):
+@pytest.mark.parametrize("allocation", [{}, {"SLURM_JOB_ID": "5"}])
+def test_ctrl_c_stops_the_jobs_at_a_checkpoint(irl, runs, tmp_path, monkeypatch, allocation):
     """The terminal signals the whole process group: submitit's processes and the steps' as well."""
     store = tmp_path / "runs"
     line = (store, "--cluster", "local", "--jobs", "2", "--until", "experts")
-    process = runs.start(*line, IRL_TEST_ROUND="1.5")
+    process = runs.start(*line, IRL_TEST_ROUND="1.5", **allocation)
     while sum("computes" in line for line in runs.lines()) < 2:
         assert process.poll() is None
         time.sleep(0.01)
@@ -213,6 +231,35 @@ def test_ctrl_c_stops_the_jobs_at_a_checkpoint(irl, runs, tmp_path, monkeypatch)
     assert stopped.startswith("error: stopped: ") and "same command again" in hint
     assert not alive(line["pid"] for line in runs.lines())
     assert len(list(store.glob(".work/*/checkpoint"))) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_signal_is_heard_while_another_command_submits(runs, tmp_path):
+    store = tmp_path / "runs"
+    process = runs.start(store, "--cluster", "local", "--until", "experts", IRL_TEST_ROUND="1.5")
+    runs.wait_for(lambda line: "computes" in line, process)
+    with Store(store).working_on(LOCK, wait=True):
+        # The first job ends, and the next one cannot be started.
+        while not Store(store).ids():
+            time.sleep(0.05)
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=100)
+    assert process.returncode == 130 and len(Store(store).ids()) == len(runs.processes()) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_failure_is_shown_for_its_own_request_only(runs, tmp_path):
+    store = tmp_path / "runs"
+    line = (store, "--cluster", "local", "--jobs", "4", *REWARDS)
+    runs.run(*line, code=1, IRL_TEST_FAIL="train_airl pooled")
+
+    def states(*more):
+        shown = runs.start(*line[:3], *REWARDS, "--status", "--json", *more).communicate()[0]
+        return [step["state"] for step in json.loads(shown)["missing"]]
+
+    assert states() == ["FAILED"]
+    assert "FAILED" not in states("--tag", "smoke", "--set", "airl.gradient_penalty=0.3")
 
 
 def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):

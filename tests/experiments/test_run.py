@@ -218,7 +218,7 @@ def test_a_failed_step_stops_only_what_depends_on_it(runs, tmp_path):
     errors = runs.run(store, "--jobs", "2", "--until", "returns", code=1, IRL_TEST_FAIL=failing)
     assert f"warning: {ROW}.irm.0 failed: " in errors and "it was asked to fail" in errors
     assert "hint: do not ask for it" in errors
-    assert f"error: 1 of 13 steps failed: {ROW}.irm.0; 1 wait for them" in errors
+    assert f"error: 1 of 13 steps failed: {ROW}.irm.0; 1 waits for it" in errors
     made = set(Store(store).names())
     assert f"{ROW}.erm.0.zero-shot-returns" in made and len(made) == 11
     assert not made & {f"{ROW}.irm.0", f"{ROW}.irm.0.zero-shot-returns"}
@@ -305,6 +305,49 @@ def test_interrupted_once_it_checkpoints_and_twice_it_kills(uninterrupted, runs,
     assert not alive(line["pid"] for line in runs.lines())
     runs.run(store, *REWARDS)
     assert Store(store).ids() == ids
+
+
+def test_a_signal_to_the_whole_process_tree_leaves_a_checkpoint(runs, tmp_path):
+    """As a batch system or a service manager sends it: the step gets it twice."""
+    store = tmp_path / "runs"
+    process = runs.start(store, "--until", "experts", IRL_TEST_ROUND="1.5")
+    runs.wait_for(lambda line: "computes" in line, process)
+    (child,) = {line["pid"] for line in runs.lines() if "computes" in line}
+    process.send_signal(signal.SIGTERM)
+    os.kill(child, signal.SIGTERM)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 130, errors
+    assert len(list(store.glob(".work/*/checkpoint"))) == 1
+
+
+def test_ctrl_c_in_a_pipeline_leaves_a_checkpoint_although_the_reader_died_of_it(runs, tmp_path):
+    store = tmp_path / "runs"
+    process = runs.start(store, "--until", "experts", IRL_TEST_ROUND="1.5")
+    runs.wait_for(lambda line: "computes" in line, process)
+    process.stderr.close()
+    process.send_signal(signal.SIGINT)
+    process.wait(timeout=200)
+    assert process.returncode == 130
+    assert len(list(store.glob(".work/*/checkpoint"))) == 1
+
+
+@pytest.mark.parametrize("more", [[], ["--cluster", "local"]])
+def test_a_step_whose_settings_changed_since_the_plan_is_not_made(runs, tmp_path, more):
+    """What is changed takes effect in a new run; a tag must not mix two configs."""
+    store, settings = tmp_path / "runs", tmp_path / "my.toml"
+    settings.write_text("[evaluation]\nepisodes = 3\n")
+    line = ("--settings", settings, "--tag", "a", "--until", "returns", *more)
+    process = runs.start(store, *line, IRL_TEST_ROUND="1")
+    runs.wait_for(lambda line: "computes" in line, process)
+    settings.write_text("[evaluation]\nepisodes = 77\n")
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == 2 and "has changed since the run was planned" in errors
+    computed = map(json.loads, runs.computed())
+    assert not [p for p in computed if p.get("evaluation", {}).get("episodes") == 77]
+    # The artefact's own command makes it whatever has changed.
+    stored = Store(store).index().artefacts.values()
+    assert not any("--expect" in artefact.provenance()["command"] for artefact in stored)
+    runs.run(store, *line[:2], "--tag", "b", *line[4:])
 
 
 def alive(pids):

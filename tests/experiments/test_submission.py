@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from test_run import TABLES, Unseen
 
+from irlcli.experiments.cluster.job import StepJob
+from irlcli.experiments.cluster.resources import Resources
+from irlcli.experiments.cluster.slurm import Slurm
 from irlcli.experiments.cluster.submission import JobCommand, Submission
 from irlcli.experiments.runner import Silent
 from irlcli.requests.session import StageSession
@@ -86,3 +90,23 @@ def test_what_others_make_while_the_probe_waits_is_not_submitted(session, tmp_pa
     assert submit(session, plan, queue) == len(plan.tasks) - 1
     assert name not in dict(queue.jobs.values())
     assert name in session.store.names()
+
+
+def test_an_array_is_submitted_without_variables_that_sbatch_prefers_to_its_script(
+    monkeypatch, tmp_path
+):
+    sbatch = tmp_path / "sbatch"
+    sbatch.write_text(
+        f'#!/bin/sh\nenv | grep ^SBATCH_ | sort > {tmp_path}/seen\necho "Submitted batch job 7"\n'
+    )
+    for name in ("sbatch", "squeue", "scancel", "scontrol", "srun"):
+        (tmp_path / name).touch()
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    given = ("PARTITION", "ACCOUNT", "MEM_PER_NODE", "OUTPUT", "ARRAY_INX", "QOS", "TIMELIMIT")
+    for name in given:
+        monkeypatch.setenv(f"SBATCH_{name}", "x")
+    resources = Resources(partition="big", extra={"account": "new", "mem": "8G"})
+    job = StepJob("step", ("true",), str(tmp_path), str(tmp_path), 0)
+    assert Slurm(resources).submit([job], tmp_path / "logs", [], None) == ["7"]
+    assert (tmp_path / "seen").read_text() == "SBATCH_QOS=x\n"

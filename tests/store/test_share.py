@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import threading
 from pathlib import Path
 
 import msgspec
@@ -229,6 +231,17 @@ def test_gc_at_the_destination_waits_for_a_push(store, chain, tmp_path):
 
     share(store, there, [chain["airl"]], pytest.fail, lambda count, total: advance)
     assert len(there.ids()) == 3 and not collected
+
+
+def test_a_push_waits_for_gc_at_the_destination(store, chain, tmp_path):
+    there, said = other(tmp_path), []
+    there.create()
+    lock = there.root / ".locks" / "gc"
+    with open(lock, "a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        threading.Timer(0.5, fcntl.flock, (file, fcntl.LOCK_UN)).start()
+        share(store, there, [chain["airl"]], said.append, lambda count, total: lambda number: None)
+    assert len(there.ids()) == 3 and "waiting" in said[0]
 
 
 def test_two_pushes_at_once(store, chain, url, monkeypatch):

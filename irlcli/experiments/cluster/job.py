@@ -65,7 +65,8 @@ class StepJob(NamedTuple):
                 sys.exit(Interrupted.exit_code)
             if code != Busy.exit_code:
                 # Otherwise the last lines say who else works on it.
-                lines.append(f"error: {self.name} was interrupted {turns + 1} times")
+                times = "once" if turns == 0 else f"{turns + 1} times"
+                lines.append(f"error: {self.name} was interrupted {times}")
                 lines.append(
                     "hint: give the jobs more time (--time), then run the same command again: it resumes"
                 )
@@ -122,12 +123,14 @@ def _is_running(received: Sequence[int]) -> bool:
     To cancel, Slurm sends the same SIGTERM as before a preemption. submitit's local executor
     cancels by SIGTERM, and sends SIGUSR2 before a time limit.
     """
+    if os.environ.get("SUBMITIT_EXECUTOR") == "local":
+        # Inside an allocation of Slurm, SLURM_JOB_ID is that of the allocation.
+        return signal.SIGTERM not in received
     job = os.environ.get("SLURM_JOB_ID")
     if "SLURM_ARRAY_TASK_ID" in os.environ:
         # The last element has the array's own id, by which Slurm shows all of them.
         job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"
-    if job is None:
-        return signal.SIGTERM not in received
+    assert job is not None, "not started by Slurm"
     done = subprocess.run(
         ["scontrol", "show", "job", "--oneliner", job], capture_output=True, text=True
     )

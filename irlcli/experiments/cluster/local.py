@@ -52,25 +52,32 @@ class Local:
 
     def states(self) -> dict[str, str]:
         """State and host of each job that has not ended, by id, those of earlier commands included."""
-        ids = {s.job for record in records(self._store, self.place) for s in record.jobs}
-        return {i: f"RUNNING {os.uname().nodename}" for i in ids if self._runs(i)}
+        logs = self._logs()
+        return {i: f"RUNNING {os.uname().nodename}" for i in logs if self._runs(i, logs[i])}
 
-    def _runs(self, job: str) -> bool:
+    def _logs(self) -> dict[str, Path]:
+        """Where each recorded job has its logs, by id."""
+        of = records(self._store, self.place)
+        return {job.job: record.logs for record in of for job in record.jobs}
+
+    def _runs(self, job: str, logs: Path) -> bool:
         if job in self._jobs:
             return self._jobs[job].state == "RUNNING"
         process = Path("/proc", job)
         try:
             words = (process / "cmdline").read_bytes()
-            # Another process may have the id by now. One that just started has no words yet; one
-            # that has ended has none left, and no program.
-            return b"submitit.local" in words or (not words and (process / "exe").exists())
+            # Another process may have the id by now, also a job of another store. One that just
+            # started has no words yet; one that has ended has none left, and no program.
+            ours = b"submitit.local" in words and os.fsencode(logs) in words
+            return ours or (not words and (process / "exe").exists())
         except OSError:
             return False
 
     def cancel(self, ids: Iterable[str]) -> None:
         """End jobs after their next checkpoint."""
+        logs = self._logs()
         for job in ids:
-            if self._runs(job):
+            if job in logs and self._runs(job, logs[job]):
                 with suppress(ProcessLookupError):
                     os.kill(int(job), signal.SIGTERM)
 

@@ -80,7 +80,7 @@ class Slurm:
         import submitit
 
         # sbatch prefers these to the script, and jobs of another name would not be found again.
-        for name in ("SBATCH_JOB_NAME", "SBATCH_TIMELIMIT", "SBATCH_NO_REQUEUE", "SBATCH_SIGNAL"):
+        for name in _overriding(self._resources):
             os.environ.pop(name, None)
         conditions = [f"afterok:{':'.join(after)}"] if after else []
         conditions += [f"aftercorr:{matching}"] if matching else []
@@ -159,6 +159,10 @@ class Slurm:
         store.jobs.mkdir(exist_ok=True)
         (store.jobs / token).touch()
         command = ["srun", "--ntasks=1", "--time=2", f"--job-name={JOB_NAME}-probe"]
+        elsewhere = os.environ.get("SBATCH_PARTITION")
+        if elsewhere and self._resources.partition is None:
+            # The jobs will run there; srun has another variable.
+            command.append(f"--partition={elsewhere}")
         command += [
             *self._resources.words(),
             sys.executable,
@@ -181,6 +185,18 @@ class Slurm:
         except (IndexError, ValueError):
             raise _refused(errors) from None
         _judge(facts, max(facts["time"] - after, before - facts["time"]), store, console)
+
+
+def _overriding(resources: Resources) -> list[str]:
+    """sbatch's environment variables for what the script of an array says."""
+    of_scripts = (
+        *("JOB_NAME", "TIMELIMIT", "NO_REQUEUE", "REQUEUE", "SIGNAL", "ARRAY_INX", "DEPENDENCY"),
+        *("OUTPUT", "ERROR", "OPEN_MODE", "CPUS_PER_TASK", "WCKEY"),
+    )
+    named = [*resources.extra, *([] if resources.partition is None else ["partition"])]
+    other_names = {"mem": "MEM_PER_NODE", "time": "TIMELIMIT", "array": "ARRAY_INX"}
+    variables = [other_names.get(n, n.replace("-", "_").upper()) for n in named]
+    return [f"SBATCH_{name}" for name in (*of_scripts, *variables)]
 
 
 def _judge(facts: dict[str, Any], clock: float, store: Store, console: RunConsole) -> None:

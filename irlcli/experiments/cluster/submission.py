@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from irlcli.errors import StageFailed
+from irlcli.errors import Busy, StageFailed
 from irlcli.experiments.cluster.arrays import Array, job_arrays
 from irlcli.experiments.cluster.job import StepJob
 from irlcli.experiments.cluster.queue import Queue, queued
@@ -246,24 +246,35 @@ class Submission:
         ready = [name for name in self._unstarted if self._ready(name)]
         started: set[str] = set()
         if ready and running < self._command.at_a_time:
-            store = self._runner.store
-            with store.working_on(LOCK, wait=True):
-                there = queued(self._plan, self._queue, store)
-                # A step that is no longer in the queue may have been made.
-                self._plan.lookup.forget_missing()
-                for name in ready:
-                    if self._exists(name):
-                        self._ended(name, last=False)
-                        continue
-                    if name in there:
-                        self._ids[name], self._records[name] = there[name].job, there[name].record
-                    elif running + len(started) < self._command.at_a_time:
-                        self._submit([name], (), None)
-                    else:
-                        continue
-                    started.add(name)
+            try:
+                # A signal must be heard, so nothing waits for another command that submits.
+                with self._runner.store.working_on(LOCK, wait=False):
+                    started = self._start(ready, self._command.at_a_time - running)
+            except Busy:
+                time.sleep(0.5)
         handled = {*self._ids, *self._outcome.made}
         self._unstarted = [name for name in self._unstarted if name not in handled]
+        return started
+
+    def _start(self, ready: Sequence[str], most: int) -> set[str]:
+        """Start at most ``most`` jobs, or find them in the queue; returns their steps."""
+        there = queued(self._plan, self._queue, self._runner.store)
+        # A step that is no longer in the queue may have been made.
+        self._plan.lookup.forget_missing()
+        started: set[str] = set()
+        for name in ready:
+            if self._stopped:
+                break
+            if self._exists(name):
+                self._ended(name, last=False)
+                continue
+            if name in there:
+                self._ids[name], self._records[name] = there[name].job, there[name].record
+            elif len(started) < most:
+                self._submit([name], (), None)
+            else:
+                continue
+            started.add(name)
         return started
 
     def _ended(self, name: str, last: bool) -> bool:
