@@ -187,8 +187,8 @@ def parse_value(env: str, knob: str, text: str) -> Value:
             if form == "absolute" and "multiplier" in spec.forms:
                 examples = f"{text.strip()}x"
             raise UsageError(
-                f"{knob}={text.strip()!r}: {env} takes {knob} as {' or '.join(spec.forms)}, "
-                f"not as {form}",
+                f"{knob}={text.strip()!r} is of the form {form}: {env} takes {knob} as "
+                f"{' or '.join(spec.forms)}",
                 f"write it like {knob}={examples}",
             )
         numbers = tuple(float(group) + 0.0 for group in match.groups())

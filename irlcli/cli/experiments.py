@@ -347,7 +347,7 @@ def _report(
     name = choice.report_name(plan.selection.tag)
     runner.store.set_name(name, artefact)
     if directory is not None:
-        copy_outputs(session, artefact, directory)
+        copy_outputs(session, artefact, directory, plan.table)
     session.print_artefact(artefact, name)
     if not session.as_json:
         print_report(session, artefact)

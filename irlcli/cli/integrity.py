@@ -57,8 +57,11 @@ def verify(
             for problem in damage.problems:
                 out.print_note(f"{id16}: {problem}")
             _print_command(id16, damage.command)
+        if ref is None:
+            _warn_of_names(session, index)
         moved = all(damage.place is not None for damage in damaged.values())
-        state = "were damaged and are now in quarantine" if moved else "are damaged"
+        was, are = ("was", "is") if len(damaged) == 1 else ("were", "are")
+        state = f"{was} damaged and {are} now in quarantine" if moved else f"{are} damaged"
         raise IntegrityError(
             f"{len(damaged)} of {checked} artefacts {state}: {', '.join(damaged)}",
             "run the commands above again to recompute them; with `--from STORE` they copy what "
@@ -71,6 +74,14 @@ def verify(
         out.print_json("verify", result)
     else:
         out.print_data(f"{out.counted(checked, 'artefact')} verified")
+
+
+def _warn_of_names(session: Session, index: Index) -> None:
+    """Warn of what :func:`_check_missing` refuses, beside an error that is worse."""
+    lost = [*session.store.damaged_names()]
+    lost += [name for made in session.store.missing(index).values() for name in made.names]
+    if lost:
+        session.console.warn(f"these names point to nothing now: {', '.join(sorted(lost))}")
 
 
 def _check_missing(session: Session, index: Index, result: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from irlcli.experiments.failures import Failure
 from irlcli.labels import duration
 
 _PLAIN_SECONDS = 60.0
+_LONGEST_NAME = 32
 
 
 class PlainJobs:
@@ -76,7 +77,7 @@ class LiveJobs(PlainJobs):
 
         super().__init__(console)
         self._progress = Progress(
-            TextColumn("{task.fields[name]}", markup=False),
+            TextColumn("{task.fields[name]}", markup=False, table_column=Column(no_wrap=True)),
             BarColumn(bar_width=12),
             TextColumn(
                 "{task.fields[detail]}",
@@ -99,7 +100,9 @@ class LiveJobs(PlainJobs):
             self._progress.start()
 
     def start(self, name: str) -> None:
-        self._bars[name] = self._progress.add_task("", total=None, name=name, detail="starting")
+        # Steps that run together differ at the end of their names.
+        shown = name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}"
+        self._bars[name] = self._progress.add_task("", total=None, name=shown, detail="starting")
 
     def line(self, name: str, text: str) -> None:
         if text.startswith("  ") and name in self._bars:

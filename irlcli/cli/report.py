@@ -137,7 +137,7 @@ def _table(
 
     for artefact in session.deliver([request], name, details):
         if directory is not None:
-            copy_outputs(session, artefact, directory)
+            copy_outputs(session, artefact, directory, plan.table)
         if not session.as_json:
             print_report(session, artefact)
 

@@ -1,5 +1,6 @@
 """The report on a table of ``settings/experiments.toml``: its request, its text, its files."""
 
+import itertools
 import os
 import shlex
 import shutil
@@ -73,27 +74,36 @@ def check_out(directory: Path, store: Path, table: "Table") -> None:
     """Refuse a directory for the files of a report on ``table`` before any work is done.
 
     Raises:
-        UsageError: it lies in the store, or has a README.md of something else.
+        UsageError: it lies in the store, or holds something else than such a report.
     """
     if Path(os.path.realpath(directory)).is_relative_to(os.path.realpath(store)):
         raise UsageError(f"--out {directory} lies in the store", "name another directory")
-    numbers = directory / f"{table.name if table.kind == 'comparison' else table.kind}.csv"
-    if (directory / "README.md").exists() and not numbers.exists():
+    numbers = directory / _numbers(table)
+    if directory.is_dir() and any(directory.iterdir()) and not numbers.exists():
         raise UsageError(
-            f"--out {directory} has a README.md but no {numbers.name}, so it holds no report on {table.name}",
+            f"--out {directory} is not empty and holds no report on {table.name}: it has no "
+            f"{numbers.name}",
             "name another directory",
         )
 
 
-def copy_outputs(session: StageSession, artefact: Artefact, directory: Path) -> None:
-    """Copy the verified outputs of ``artefact`` to ``directory``.
+def _numbers(table: "Table") -> str:
+    """The file with the numbers of every report on ``table``."""
+    return f"{table.name if table.kind == 'comparison' else table.kind}.csv"
+
+
+def copy_outputs(
+    session: StageSession, artefact: Artefact, directory: Path, table: "Table"
+) -> None:
+    """Copy the verified outputs of ``artefact``, a report on ``table``, to ``directory``.
 
     Raises:
         StageFailed: the directory cannot be written.
     """
     try:
-        # README.md last: check_out takes it for a report's if the others lie beside it.
-        for output in sorted(artefact.manifest.outputs, key=lambda one: one.path == "README.md"):
+        # The numbers first: by them check_out knows the directory again.
+        of = sorted(artefact.manifest.outputs, key=lambda one: one.path != _numbers(table))
+        for output in of:
             target = directory / output.path
             target.parent.mkdir(parents=True, exist_ok=True)
             # Whole or absent, also if this process is killed.
@@ -115,9 +125,7 @@ def print_report(session: StageSession, artefact: Artefact) -> None:
     _warn_of_versions(session, artefact)
     report = report_json(session, artefact)
     if report is None:
-        out.print_note(
-            session.store.open(artefact, "README.md").read_text(encoding="utf-8").rstrip()
-        )
+        _print_page(session.store.open(artefact, "README.md").read_text(encoding="utf-8"))
         return
     shown = [table for table in report["tables"] if table["title"] != EVERY_CELL]
     for table in shown:
@@ -128,6 +136,17 @@ def print_report(session: StageSession, artefact: Artefact) -> None:
     for heading, lines in (("Caveats", report["caveats"]), ("In short", report.get("in_short"))):
         if lines:
             out.print_note("\n".join([f"{heading}:", *(f"- {line}" for line in lines), ""]))
+
+
+def _print_page(page: str) -> None:
+    """A page of Markdown on stderr, with its tables as tables and without its pictures."""
+    for is_table, block in itertools.groupby(page.splitlines(), lambda line: line[:1] == "|"):
+        if is_table:
+            head, _, *rows = [line.strip("| ").split(" | ") for line in block]
+            out.print_table(head, rows, stderr=True)
+        else:
+            kept = "\n".join(line for line in block if not line.startswith("!["))
+            out.print_note(kept.strip("\n") + "\n" if kept.strip() else "")
 
 
 def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:

@@ -84,6 +84,8 @@ class _Child:
     def __init__(self, name: str, command: Sequence[str], lines: SimpleQueue):
         self.name = name
         self.started = time.monotonic()
+        #: Whether it waits for a process of another run.
+        self.waits = False
         self.last: deque[str] = deque(maxlen=LAST_LINES)
         # A process group of its own: Ctrl-C on the terminal reaches it through this process only.
         self.process = subprocess.Popen(
@@ -101,6 +103,8 @@ class _Child:
         for raw in self.process.stderr:
             text = raw.decode("utf-8", "replace").rstrip()
             self.last.append(text)
+            if text.startswith(("WAIT ", "RUN ", "RESUME ")):
+                self.waits = text.startswith("WAIT ")
             lines.put((self.name, text))
 
     def stop(self, at_once: bool) -> None:
@@ -183,7 +187,7 @@ class Execution:
 
     def _start_ready(self) -> None:
         for name in list(self._waiting):
-            if len(self._running) >= self._jobs or self._signals:
+            if self._is_full or self._signals:
                 return
             if not self._done.issuperset(self._plan.needs[name]):
                 continue
@@ -199,6 +203,12 @@ class Execution:
                 self._waiting.remove(name)
                 self._running[name] = _Child(name, self._command(name), self._lines)
                 self._display.start(name)
+
+    @property
+    def _is_full(self) -> bool:
+        # A process that waits for another run's does nothing, so one more may run in its place.
+        waiting = sum(child.waits for child in self._running.values())
+        return len(self._running) - min(waiting, self._jobs) >= self._jobs
 
     def _copy(self, name: str) -> bool:
         """Copy a step's artefact; otherwise a process makes it, or waits for another one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
@@ -62,6 +63,8 @@ def film(
         UsageError: a setting's observations differ from those the policy was trained on, or the
             environment draws no pictures.
     """
+    # pygame, which draws many environments, would look for a display and complain.
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with ExitStack() as stack:
         with warnings.catch_warnings():
             # Gymnasium's, of an environment without pictures; the error below says it.

@@ -160,7 +160,8 @@ def _listed(config: "Config", knob: str, kind: Literal["id", "ood"]) -> str:
     """The values of a knob in the settings file, as the end of a hint."""
     known = config.interventions.get(knob)
     values = () if known is None else getattr(known, kind)
-    return f"; the {kind.upper()} values in settings are {', '.join(values)}" if values else ""
+    what = "held-out" if kind == "ood" else "training"
+    return f"; {what} values in the settings file: {', '.join(values)}" if values else ""
 
 
 def experts(

@@ -134,7 +134,11 @@ def _of_agent(
 ) -> list[Request]:
     if env is None or not where.given:
         missing = [] if env is not None else ["--env ENV"]
-        missing += [] if where.given else ["--intervention KNOB=VALUE,VALUE or --ood KNOB=VALUE"]
+        missing += (
+            []
+            if where.given
+            else ["--intervention KNOB=VALUE,VALUE, --ood KNOB=VALUE or --setting default"]
+        )
         raise UsageError(
             f"--{agent} needs an environment and the settings to evaluate in",
             f"add {' and '.join(missing)}",

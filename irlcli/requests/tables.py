@@ -145,9 +145,12 @@ def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] 
     selection = Selection(tag, candidates, until, choice.only, listing)
     plan = Plan(table, selection, session.config, session.runner().lookup())
     _check_weights(session, table)
-    if choice.only is None:
-        # The processes that make one step each would repeat it.
-        session.warn_of_unread([task.request for task in plan.tasks.values()], table.name)
+    if choice.only is None and session.asked:
+        # The processes that make one step each would repeat it. Later phases may read what the
+        # first ones do not.
+        every = selection._replace(until=PHASES[-1])
+        whole = plan if every == selection else Plan(table, every, session.config, plan.lookup)
+        session.warn_of_unread([task.request for task in whole.tasks.values()], table.name)
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan

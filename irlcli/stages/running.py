@@ -47,8 +47,8 @@ def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
         if first and all(isnan(row["true_return"]) for row in newest):
             job.console.warn(
                 "no episode ended in the first round. Every round starts new episodes, so nothing is learned "
-                "about the steps of an episode after the end of its round: raise n_steps or "
-                "rollouts_per_round"
+                "about the steps of an episode after the end of its round: raise n_steps "
+                "(for PPO rollouts_per_round does it, too)"
             )
         job.checkpoints.offer(encoded)
 
@@ -158,7 +158,9 @@ def warn_of_failures(
 
 def shown(true_return: float, progress: float | None) -> str:
     """A true return for the user, with the environment's progress if it reports one."""
-    no_progress = progress is None or progress != progress
+    if isnan(true_return):
+        return "no episode has ended"
+    no_progress = progress is None or isnan(progress)
     return f"return {true_return:z.0f}" + ("" if no_progress else f" progress {progress:z.0f}")
 
 

@@ -6,6 +6,7 @@ import ctypes
 import errno
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -333,6 +334,17 @@ def test_using_the_store_while_gc_runs(irl, store_copy, hold):
     pid = hold(store_copy.path / ".locks" / "gc")
     line = arguments(f"evaluate --idle {LANDER} --no-wait", store_copy.path)
     assert_answered(irl(*line), 75, f"process {pid}")
+
+
+def test_verify_names_lost_names_beside_damaged_artefacts(irl, store_copy):
+    store = store_copy.path
+    shutil.rmtree(store / store_copy.evaluation)
+    damaged = store / store_copy.transfer / "policy.pt"
+    damaged.chmod(0o644)
+    damaged.write_bytes(b"x")
+    done = irl("verify", "--store", store)
+    assert done.code == 4 and store_copy.transfer in done.err
+    assert "these names point to nothing now: moved, score" in done.err
 
 
 def test_a_stage_that_fails_is_named(irl, tmp_path):

@@ -415,6 +415,12 @@ def test_a_value_that_the_others_leave_without_effect_is_named(
     assert warned == unused
 
 
+def test_a_phase_does_not_warn_of_what_a_later_phase_reads(irl, tmp_path):
+    line = ["plan", "table1", "--rows", "lunar-lander", "--until", "experts", "--tag", "x"]
+    done = irl(*line, "--set", "airl.penalty_weight=3", *SMOKE, "--store", tmp_path / "runs")
+    assert done.code == 0 and "reads --set" not in done.err
+
+
 @pytest.mark.parametrize("start", ["scratch", "student"])
 def test_what_only_a_policy_from_the_student_reads_is_named(irl, smoke_store, start):
     line = ["transfer", "--reward", "airl", "--ood", "1.5x", "--start", start, "--dry-run"]

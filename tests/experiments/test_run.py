@@ -212,6 +212,22 @@ def test_two_runs_at_once_make_each_artefact_once(uninterrupted, runs, tmp_path)
     assert set(runs.computed().values()) == {1} and len(runs.computed()) == len(ids)
 
 
+def test_a_run_makes_other_steps_while_it_waits_for_another_run(uninterrupted, runs, tmp_path):
+    """With one job each, two runs would otherwise do every step together."""
+    store = tmp_path / "runs"
+    line = (store, "--until", "experts")
+    first = runs.start(*line, IRL_TEST_ROUND="4")
+    runs.wait_for(lambda line: "computes" in line, first)
+    second = runs.start(*line, IRL_TEST_ROUND="0.1")
+    _, errors = second.communicate(timeout=600)
+    assert second.returncode == 0 and "WAIT " in errors, errors
+    assert first.communicate(timeout=600) and first.returncode == 0
+    assert len(Store(store).ids()) == 3 and set(runs.computed().values()) == {1}
+    waited, *_ = (line.split()[1] for line in errors.splitlines() if line.startswith("WAIT "))
+    done = [line.split()[1] for line in errors.splitlines() if line.startswith("DONE ")]
+    assert done[-1] == waited.rstrip(":") and len(done) == 3
+
+
 def test_a_failed_step_stops_only_what_depends_on_it(runs, tmp_path):
     store = tmp_path / "runs"
     failing = "train_airl per-setting"

@@ -290,9 +290,8 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
         for command in ("report", "run"):
             assert "is not a directory" in refused(command, "demo", "--out", tmp_path / place)
     assert "lies in the store" in refused("run", "demo", "--out", tmp_path / "runs" / "out")
-    (tmp_path / "README.md").touch()
     for command in ("report", "run"):
-        assert "has a README.md" in refused(command, "demo", "--out", tmp_path)
+        assert "is not empty" in refused(command, "demo", "--out", tmp_path)
         assert "--out" in refused(command, "demo", "--out", "")
     assert "--until stops before it" in refused("run", "demo", "--until", "demos", "--out", "x")
     for command in ("plan", "run"):
