@@ -98,7 +98,7 @@ def _stage_session(
         typer.Option(
             "--set",
             help="FIELD=VALUE, e.g. airl.total_steps=100000. Repeatable. "
-            "An unknown FIELD lists the known ones.",
+            "For an unknown FIELD the nearest ones are named.",
         ),
     ] = [],  # noqa: B006
     sources: Annotated[

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from irlcli.errors import UsageError, suggest
 from irlcli.experiments import references
+from irlcli.interventions import parse_setting
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
 from irlcli.stages import transfer as stage
@@ -53,6 +54,12 @@ def transfer(
         )
     if ood is not None:
         arguments.warn_of_seen(session.console, settings, origin, reward)
+    learned = {k for text in origin.settings for k in parse_setting(origin.env, text).knobs}
+    for knob in sorted(set(settings[0].knobs) - learned):
+        session.console.warn(
+            f"{reward!r} was learned in settings that do not change {knob}; the policy has the "
+            f"budget of {settings[0]}"
+        )
     label = reward_label(origin.airl, origin.seed)
     return stage.request(
         source,

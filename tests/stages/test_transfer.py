@@ -242,6 +242,12 @@ def test_a_setting_that_selected_the_round_is_not_held_out():
     assert said == ["mass=2x is not held out: it selected the round of 'irm'"]
 
 
+def test_a_knob_that_the_reward_has_not_seen_changed_is_named(runs, irl):
+    line = ["transfer", "--reward", "airl", *common(runs), "--dry-run", "--ood"]
+    assert "do not change mass" in irl(*line, "mass=2x").err
+    assert "do not change" not in irl(*line, "friction").err
+
+
 @pytest.mark.parametrize("settings", [("default", "mass=2x"), ("mass=2x", "default")])
 def test_values_alone_belong_to_the_only_knob_of_all_training_settings(settings):
     origin = SimpleNamespace(env="ant", settings=settings)
