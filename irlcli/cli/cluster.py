@@ -290,7 +290,7 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
             why = f"job {there[name].job} {place}"
             lines.append({"name": name, "state": state, "job": there[name].job, "why": why})
             continue
-        of = last.get(plan.identities[name]) if step.status == "RUN" else None
+        of = last.get(plan.identities[name]) if step.status in ("RUN", "RESUME") else None
         failure = None if of is None else of.failure(name)
         if failure is not None:
             lines.append({"name": name, "state": "FAILED", "job": None, "why": failure.message})

@@ -133,7 +133,10 @@ def run(
     session: StageSession,
     table: _TableName,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes at a time. Default: 1.")
+        int | None,
+        typer.Option(
+            min=1, help="Processes at a time, besides one that waits for another run. Default: 1."
+        ),
     ] = None,
     seeds: Seeds = None,
     methods: Methods = None,
@@ -248,7 +251,7 @@ def run(
             if expect not in (None, plan.identities[only]):
                 raise UsageError(
                     f"what {only} is made from has changed since the run was planned: its settings, "
-                    "its table or the program",
+                    "its table, its environment's code or the version of a stage",
                     "run the same command again, with another --tag where the values differ",
                 )
             _make_one(session, runner, plan, only)

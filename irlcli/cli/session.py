@@ -159,7 +159,10 @@ class StageSession(base.StageSession):
             return []
         artefacts = self.run(requests, name)
         if self.tensorboard is not None and not self.console.wrote_scalars:
-            self.console.warn(f"nothing was trained, so nothing was written to {self.tensorboard}")
+            self.console.warn(
+                f"nothing was written to {self.tensorboard}: only trainings of experts, of rewards by "
+                "train-airl and of retrained policies write metrics, and none ran"
+            )
         for artefact in artefacts:
             self.print_artefact(artefact, name, details)
         return artefacts

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -79,7 +80,9 @@ def check_out(directory: Path, store: Path, table: "Table") -> None:
     if Path(os.path.realpath(directory)).is_relative_to(os.path.realpath(store)):
         raise UsageError(f"--out {directory} lies in the store", "name another directory")
     numbers = directory / _numbers(table)
-    if directory.is_dir() and any(directory.iterdir()) and not numbers.exists():
+    # Hidden files: of a copy that was killed, or of the system.
+    others = directory.is_dir() and any(path.name[0] != "." for path in directory.iterdir())
+    if others and not numbers.exists():
         raise UsageError(
             f"--out {directory} is not empty and holds no report on {table.name}: it has no "
             f"{numbers.name}",
@@ -146,7 +149,9 @@ def _print_page(page: str) -> None:
             out.print_table(head, rows, stderr=True)
         else:
             kept = "\n".join(line for line in block if not line.startswith("!["))
-            out.print_note(kept.strip("\n") + "\n" if kept.strip() else "")
+            out.print_note(
+                re.sub("\n{3,}", "\n\n", kept).strip("\n") + "\n" if kept.strip() else ""
+            )
 
 
 def _warn_of_versions(session: StageSession, artefact: Artefact) -> None:

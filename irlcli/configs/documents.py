@@ -43,7 +43,11 @@ def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
         return parse_toml(path.read_text("utf-8"))
     except (ValueError, RecursionError) as error:
         syntax = isinstance(error, tomllib.TOMLDecodeError)
-        quotes = 'text is in quotes ("0.5x"), and each [section] is there once; ' if syntax else ""
+        quotes = (
+            'text is in quotes ("0.5x"), and each [section] may appear only once; '
+            if syntax
+            else ""
+        )
         raise UsageError(
             f"{path} is not valid TOML: {error}", f"{quotes}see settings/ for examples"
         ) from None

@@ -206,9 +206,10 @@ class Execution:
 
     @property
     def _is_full(self) -> bool:
-        # A process that waits for another run's does nothing, so one more may run in its place.
-        waiting = sum(child.waits for child in self._running.values())
-        return len(self._running) - min(waiting, self._jobs) >= self._jobs
+        # A process that waits for another run's does nothing, so one more may run. If the other run
+        # stops, both compute.
+        waits = any(child.waits for child in self._running.values())
+        return len(self._running) >= self._jobs + waits
 
     def _copy(self, name: str) -> bool:
         """Copy a step's artefact; otherwise a process makes it, or waits for another one."""
@@ -241,7 +242,8 @@ class Execution:
             why = child.failure()
             # The traceback is that process's own: only a command that runs no other one shows it.
             if "--debug" in why.hint:
-                words = self._command(child.name)
+                words = [word for word in self._command(child.name) if word != "--expect"]
+                words = [word for word in words if word != self._plan.identities[child.name]]
                 again = shlex.join(["irl", *words[words.index("run") :], "--debug"])
                 why = why._replace(hint=f"{why.hint}: `{again}`")
         code = child.process.returncode

@@ -200,6 +200,12 @@ def text_of(given: Any) -> str:
     return os.fspath(given) if isinstance(given, os.PathLike) else str(given)
 
 
+def fixed(place: Any) -> str:
+    """A path that does not depend on the working directory; a URL as it is."""
+    text = text_of(place)
+    return text if "://" in text else os.path.abspath(text)
+
+
 def number(name: str, given: float | None) -> float | None:
     """``given`` as a float.
 

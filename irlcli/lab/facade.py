@@ -12,6 +12,7 @@ from irlcli.envs import registry
 from irlcli.lab.arguments import (
     Configs,
     Overrides,
+    fixed,
     joined,
     listed,
     merged,
@@ -74,12 +75,12 @@ class Lab:
         quiet: bool = False,
     ):
         # A notebook may change its working directory.
-        self.store = Path(store).absolute()
+        self.store = Path(fixed(store))
         self.profile = profile
-        self.settings = settings
+        self.settings = None if settings is None else fixed(settings)
         self.set = overrides(set)
         overridden(self.set)
-        self.sources = [text_of(source) for source in listed(from_)]
+        self.sources = [fixed(source) for source in listed(from_)]
         self.workers = whole("workers", workers, 1)
         self.wait = wait
         self._console = console(quiet)

@@ -177,7 +177,6 @@ def _interval(point: np.ndarray, draws: np.ndarray, count: int) -> Interval | No
         return None
     if count < FEWEST_RESAMPLED:
         return Interval(value=float(point[0]))
-
     low, high = np.nanpercentile(draws, [2.5, 97.5])
     return Interval(value=float(point[0]), low=float(low), high=float(high))
 

@@ -70,8 +70,9 @@ class Where(NamedTuple):
         """
         if self.text is not None and self.several:
             raise UsageError(
-                f"{what} follow the order of the settings, but --intervention and --setting have none",
-                "name every setting by --setting, in that order",
+                f"{what} follow the order of the settings, but there is no order between "
+                "--intervention and --setting",
+                "name all settings with --setting only, in that order",
             )
 
 

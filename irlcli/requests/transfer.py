@@ -55,10 +55,11 @@ def transfer(
     if ood is not None:
         arguments.warn_of_seen(session.console, settings, origin, reward)
     learned = {k for text in origin.settings for k in parse_setting(origin.env, text).knobs}
-    for knob in sorted(set(settings[0].knobs) - learned):
+    new = [knob for knob in settings[0].knobs if knob not in learned]
+    if new:
         session.console.warn(
-            f"{reward!r} was learned in settings that do not change {knob}; the policy has the "
-            f"budget of {settings[0]}"
+            f"{reward!r} was learned in settings that do not change {' or '.join(new)}: it may not "
+            "hold there"
         )
     label = reward_label(origin.airl, origin.seed)
     return stage.request(

@@ -67,8 +67,10 @@ def test_another_run_sees_a_job_from_its_start_to_its_end(tmp_path):
     queue = Local(store, None)
     for _ in range(20):
         record = new_record(store, queue.place)
+        # The other run may have named the store by another path.
+        logs = tmp_path / ".." / tmp_path.name / record.logs.relative_to(tmp_path)
         line = [sys.executable, "-S", "-c", "import sys; sys.stdin.read()", "submitit.local"]
-        process = subprocess.Popen([*line, str(record.logs)], stdin=subprocess.PIPE)
+        process = subprocess.Popen([*line, str(logs)], stdin=subprocess.PIPE)
         record.add([Submitted("step", "identity", str(process.pid))])
         assert str(process.pid) in queue.states()
         process.stdin.close()
@@ -259,6 +261,17 @@ def test_a_failure_is_shown_for_its_own_request_only(runs, tmp_path):
         return [step["state"] for step in json.loads(shown)["missing"]]
 
     assert states() == ["FAILED"]
+    # Also of a step that left a checkpoint, and from another directory's view of the store.
+    late = (*line[:5], "--tag", "late", "--until", "experts", "--set", "expert.total_steps=999")
+    process = runs.start(*late, "--requeues", "0", IRL_TEST_ROUND="1")
+    while not list(store.glob(".work/*/checkpoint")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    for pid in {line["pid"] for line in runs.lines() if "computes" in line}:
+        if alive([pid]):
+            os.kill(pid, signal.SIGUSR2)
+    assert process.communicate(timeout=200) and process.returncode == 130
+    assert "FAILED" in states("--tag", "late", "--set", "expert.total_steps=999")
     assert "FAILED" not in states("--tag", "smoke", "--set", "airl.gradient_penalty=0.3")
 
 

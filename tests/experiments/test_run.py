@@ -216,9 +216,15 @@ def test_a_run_makes_other_steps_while_it_waits_for_another_run(uninterrupted, r
     """With one job each, two runs would otherwise do every step together."""
     store = tmp_path / "runs"
     line = (store, "--until", "experts")
-    first = runs.start(*line, IRL_TEST_ROUND="4")
+    first = runs.start(*line, IRL_TEST_ROUND="1")
     runs.wait_for(lambda line: "computes" in line, first)
+    (child,) = {line["pid"] for line in runs.lines() if "computes" in line}
+    os.kill(child, signal.SIGSTOP)
     second = runs.start(*line, IRL_TEST_ROUND="0.1")
+    while len(Store(store).ids()) < 2:
+        assert second.poll() is None
+        time.sleep(0.05)
+    os.kill(child, signal.SIGCONT)
     _, errors = second.communicate(timeout=600)
     assert second.returncode == 0 and "WAIT " in errors, errors
     assert first.communicate(timeout=600) and first.returncode == 0

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -98,10 +99,20 @@ def test_a_lab_keeps_its_store_when_the_working_directory_changes(
     store_copy, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(store_copy.path.parent)
-    lab = irlcli.Lab(store_copy.path.name, profile="smoke")
+    Path("my.toml").write_text("[evaluation]\nepisodes = 2\n")
+    lab = irlcli.Lab(store_copy.path.name, profile="smoke", settings="my.toml", from_="zoo")
     monkeypatch.chdir(tmp_path)
+    assert lab.plan("table1", rows="lunar-lander", tag="x").steps
+    assert lab.sources == [str(store_copy.path.parent / "zoo")]
     assert lab.artefact("airl").id == store_copy.airl
     assert len(lab.artefact("demos").to_pandas())
+
+
+@pytest.mark.parametrize("url", ["https://example.org/runs", "s3://bucket/x"])
+def test_a_lab_has_no_store_behind_a_url(url):
+    with pytest.raises(UsageError, match="is a URL"):
+        irlcli.Lab(url)
+    assert irlcli.Lab("runs", from_=url).sources == [url]
 
 
 def test_a_path_with_two_dashes_is_named_as_it_is(lab):

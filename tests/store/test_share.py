@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import threading
 from pathlib import Path
 
 import msgspec
@@ -236,11 +235,14 @@ def test_gc_at_the_destination_waits_for_a_push(store, chain, tmp_path):
 def test_a_push_waits_for_gc_at_the_destination(store, chain, tmp_path):
     there, said = other(tmp_path), []
     there.create()
-    lock = there.root / ".locks" / "gc"
-    with open(lock, "a") as file:
+    with open(there.root / ".locks" / "gc", "a") as file:
+
+        def warn(text: str) -> None:
+            said.append(text)
+            fcntl.flock(file, fcntl.LOCK_UN)
+
         fcntl.flock(file, fcntl.LOCK_EX)
-        threading.Timer(0.5, fcntl.flock, (file, fcntl.LOCK_UN)).start()
-        share(store, there, [chain["airl"]], said.append, lambda count, total: lambda number: None)
+        share(store, there, [chain["airl"]], warn, lambda count, total: lambda number: None)
     assert len(there.ids()) == 3 and "waiting" in said[0]
 
 

@@ -68,7 +68,8 @@ class Local:
             words = (process / "cmdline").read_bytes()
             # Another process may have the id by now, also a job of another store. One that just
             # started has no words yet; one that has ended has none left, and no program.
-            ours = b"submitit.local" in words and os.fsencode(logs) in words
+            # The path of a store may be written in several ways, the name of a record may not.
+            ours = b"submitit.local" in words and os.fsencode(f"/{logs.parent.name}/") in words
             return ours or (not words and (process / "exe").exists())
         except OSError:
             return False

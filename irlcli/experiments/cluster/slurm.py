@@ -194,8 +194,7 @@ def _overriding(resources: Resources) -> list[str]:
         *("OUTPUT", "ERROR", "OPEN_MODE", "CPUS_PER_TASK", "WCKEY"),
     )
     named = [*resources.extra, *([] if resources.partition is None else ["partition"])]
-    other_names = {"mem": "MEM_PER_NODE", "time": "TIMELIMIT", "array": "ARRAY_INX"}
-    variables = [other_names.get(n, n.replace("-", "_").upper()) for n in named]
+    variables = ["MEM_PER_NODE" if n == "mem" else n.replace("-", "_").upper() for n in named]
     return [f"SBATCH_{name}" for name in (*of_scripts, *variables)]
 
 
