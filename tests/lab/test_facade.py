@@ -95,15 +95,15 @@ def test_every_option_of_a_command_is_an_argument(command):
     assert arguments == {option.name for option in found.params} - general
 
 
-def test_a_lab_keeps_its_store_when_the_working_directory_changes(
+def test_a_lab_keeps_its_files_when_the_working_directory_changes(
     store_copy, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(store_copy.path.parent)
     Path("my.toml").write_text("[evaluation]\nepisodes = 2\n")
-    lab = irlcli.Lab(store_copy.path.name, profile="smoke", settings="my.toml", from_="zoo")
-    monkeypatch.chdir(tmp_path)
+    where = {"settings": "my.toml", "from_": store_copy.path.name}
+    lab = irlcli.Lab(store_copy.path.name, profile="smoke", **where)
+    monkeypatch.chdir(tmp_path.parent)
     assert lab.plan("table1", rows="lunar-lander", tag="x").steps
-    assert lab.sources == [str(store_copy.path.parent / "zoo")]
     assert lab.artefact("airl").id == store_copy.airl
     assert len(lab.artefact("demos").to_pandas())
 
