@@ -263,7 +263,11 @@ def test_figure_and_table(run, store):
     table, _, paired = page.partition("## Paired differences")
     assert sum(line.startswith("| ") for line in table.splitlines()) == 2 + len(names)
     assert "| irm irmv1 0.01 | irm-shuffled irmv1 0.01 | " in paired
-    assert "20 episodes in path-group=1" in page and page in first.err
+    assert "20 episodes in path-group=1" in page
+    assert "![" not in first.err and "|" not in first.err
+    shown = [line for line in page.splitlines() if line and not line.startswith(("|", "!["))]
+    assert all(line in first.err for line in shown)
+    assert "irm irmv1 0.01  irm-shuffled irmv1 0.01  " in re.sub(" {2,}", "  ", first.err)
     plan = run("report", "figure2", "--dry-run").out.splitlines()
     assert len(plan) == 4 and all(line.startswith("HIT") for line in plan)
     warned = run("report", "figure2", "--set", "maxent.penalty_weight=3", "--dry-run").err
@@ -299,7 +303,7 @@ SIZE = ["--set", "gridworld.size=1024"]
         ([*COLLECT, "path-group=1.5"], "not a whole number"),
         ([*COLLECT, "path-group=4"], "out of range"),
         ([*COLLECT, "path-group=-1"], "out of range"),
-        ([*COLLECT, "blocked=2x"], "not as multiplier"),
+        ([*COLLECT, "blocked=2x"], "blocked as absolute"),
         ([*COLLECT, "path-group=1,2", "--episodes", "3,0"], "--episodes 0"),
         ([*COLLECT, "path-group=1", "--set", "gridworld.horizon=5"], "8 steps away"),
         ([*COLLECT, "path-group=1", "--set", "gridworld.size=4"], "at least 5"),

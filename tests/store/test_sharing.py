@@ -141,7 +141,7 @@ def test_what_was_quarantined_is_missing_with_the_command_that_makes_it(irl, emp
     empty_store.set_name("best", made)
     (made.directory / "reward.pt").chmod(0o644)
     (made.directory / "reward.pt").write_bytes(b"other")
-    assert "1 of 1 artefacts were damaged" in irl("verify", "--store", empty_store.root).err
+    assert "1 of 1 artefacts was damaged" in irl("verify", "--store", empty_store.root).err
     result = irl("verify", "--store", empty_store.root)
     assert result.code == 4
     assert "irl train-airl" in result.err
