@@ -98,7 +98,7 @@ def weak_experts(
         if expert is not None and len(others) and others.max() > expert:
             found.append(
                 f"Weak expert: {row.name}: in {row.unseen} {others.idxmax()} earn {others.max():.1f}, "
-                f"that setting's own expert {expert:.1f}. It may not be the best policy known."
+                f"that setting's own expert {expert:.1f}. That expert may not be the best policy known."
             )
     return found
 
