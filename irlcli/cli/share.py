@@ -47,8 +47,9 @@ def push(
 
     session.check_exists()
     place = open_place(to, session.console.warn)
-    artefacts = _chosen(session.store, session.artefact, refs, everything)
-    _share(session, session.store, place, artefacts, f"push to {place.root}", quiet, everything)
+    artefacts, unread = _chosen(session.store, session.artefact, refs, everything)
+    label = f"push to {place.root}"
+    _share(session, session.store, place, artefacts, label, quiet, everything, unread)
 
 
 @store_command
@@ -76,7 +77,7 @@ def pull(
         return artefact
 
     try:
-        artefacts = _chosen(place, there, refs, everything)
+        artefacts, unread = _chosen(place, there, refs, everything)
     except NotFound as error:
         listing = shlex.join(["irl", "ls", "--from", str(place.root)])
         raise NotFound(
@@ -87,20 +88,25 @@ def pull(
     except IntegrityError as error:
         error.hint = _damaged_there(place)
         raise
-    _share(session, place, session.store, artefacts, f"pull from {place.root}", quiet, everything)
+    label = f"pull from {place.root}"
+    _share(session, place, session.store, artefacts, label, quiet, everything, unread)
 
 
 def _chosen(
     store: "Place", find: Callable[[str], Artefact], refs: list[str] | None, everything: bool
-) -> list[Artefact]:
-    """The artefacts of ``store`` that a command line names, each once; ``find`` looks one up."""
+) -> tuple[list[Artefact], list[str]]:
+    """The artefacts of ``store`` that a command line names, each once; ``find`` looks one up.
+
+    With ``--all`` also the ids of those whose manifests are damaged.
+    """
     if refs and everything:
         raise UsageError("REF and --all are both given", "give one of them")
     if everything:
-        return list(store.index().artefacts.values())
+        ids, index = store.ids(), store.index()
+        return list(index.artefacts.values()), sorted(set(ids) - {*index.artefacts, *index.newer})
     if not refs:
         raise UsageError("name artefacts, or give --all", "either REF... or --all")
-    return list({artefact.id: artefact for artefact in map(find, refs)}.values())
+    return list({artefact.id: artefact for artefact in map(find, refs)}.values()), []
 
 
 def _share(
@@ -111,6 +117,7 @@ def _share(
     label: str,
     quiet: bool,
     everything: bool,
+    unread: list[str],
 ) -> None:
     from irlcli.store.share import share
 
@@ -151,28 +158,36 @@ def _share(
             f"{id16} is kept beside {holder}: the same request gave {holder} in {target.root}, and "
             "commands find that one"
         )
-    # One that was made from a damaged one was skipped.
     there = {artefact.id for artefact in (*shared.copied, *shared.present)}
+    left_out = [*unread, *(artefact.id for artefact in artefacts if artefact.id not in there)]
     artefacts = [artefact for artefact in artefacts if artefact.id in there]
     where = f"{target.root}/"
     console.say(
         f"{out.counted(len(shared.copied), 'artefact')}, {shared.bytes:,} bytes copied to {target.root}; "
         f"{len(shared.present)} there already"
     )
+    document: dict[str, Any] = {
+        "artefacts": [{"id": a.id, "path": where + a.id} for a in artefacts],
+        "copied": [a.id for a in shared.copied],
+        "present": [a.id for a in shared.present],
+        "bytes": shared.bytes,
+        "names": shared.names,
+        "names_kept": shared.taken,
+        "diverged": shared.diverged,
+        "left_out": left_out,
+    }
+    if not session.as_json:
+        for artefact in artefacts:
+            out.print_data(where + artefact.id)
+    if left_out:
+        raise IntegrityError(
+            f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, because of "
+            f"damaged files: {', '.join(left_out)}",
+            _damaged_there(source),
+            document,
+        )
     if session.as_json:
-        document: dict[str, Any] = {
-            "artefacts": [{"id": a.id, "path": where + a.id} for a in artefacts],
-            "copied": [a.id for a in shared.copied],
-            "present": [a.id for a in shared.present],
-            "bytes": shared.bytes,
-            "names": shared.names,
-            "names_kept": shared.taken,
-            "diverged": shared.diverged,
-        }
         out.print_json("shared", document)
-        return
-    for artefact in artefacts:
-        out.print_data(where + artefact.id)
 
 
 def _damaged_there(place: "Place") -> str:
