@@ -136,23 +136,29 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
 def check_names(tables: Iterable[Table]) -> None:
     """Refuse two tables whose steps have one name and another config.
 
-    Tables without settings of their own share the names of equal rows and methods.
+    Tables without settings of their own share the names of equal rows and methods. A table with
+    settings shares them only with a table of the same name in another file.
 
     Raises:
         UsageError: names both tables.
     """
-    first: dict[tuple[Row, str], tuple[str, Any]] = {}
+    first: dict[tuple[str, Row, str], tuple[str, Any]] = {}
     for table in tables:
-        if table.settings is not None:
-            continue
+        own = table.settings
+        scope = "" if own is None else table.name
+        parts = [] if own is None else [("", own.read_bytes(), "other settings", "")]
         for row in table.rows:
-            for name, config, differs, hint in _identified(table):
-                other, same = first.setdefault((row, name), (table.name, config))
+            for name, config, differs, hint in (*parts, *_identified(table)):
+                other, same = first.setdefault((scope, row, name), (table.name, config))
                 if same != config:
+                    part = f"{name} in {row}" if name else str(row)
+                    than = "the shipped table of that name" if other == table.name else repr(other)
                     raise UsageError(
-                        f"{table.name!r} has {name} in {row} with {differs} than {other!r}, so "
-                        "different results would have one name",
-                        f"write settings = FILE in [{table.name}], or {hint}",
+                        f"{table.name!r} has {part} with {differs} than {than}, so different "
+                        "results would have one name",
+                        f"give the table another name{hint and f', or {hint}'}"
+                        if scope
+                        else f"write settings = FILE in [{table.name}], or {hint}",
                     )
 
 

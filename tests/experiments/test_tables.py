@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from irlcli.configs import load_config
+from irlcli.configs.load import settings_directory
 from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.tables import load_table, load_tables, narrowed
 
@@ -329,3 +330,29 @@ def test_the_command_line_refuses_what_no_table_has(irl, tmp_path):
     for more in (["--tag", "x"], ["--methods", "erm"]):
         assert irl(*sound, *more).code == 0
     assert "cannot be read" in refused("plan", "mine", "--experiments", tmp_path / "none.toml")
+
+
+def test_settings_of_another_table_of_a_shipped_name_need_a_tag(irl, tmp_path):
+    """Names of steps begin with the name of a table that has settings."""
+    shipped = (settings_directory() / "five-settings" / "lunar-lander.toml").read_text()
+    own = tmp_path / "mine.toml"
+    own.write_text(
+        """
+        [table1-5]
+        rows = ["lunar-lander.bounce"]
+        methods = ["erm", "irm"]
+        seeds = [0]
+        measures = ["transfer"]
+        settings = "mine/lunar-lander.toml"
+        """
+    )
+    settings = tmp_path / "mine" / "lunar-lander.toml"
+    settings.parent.mkdir()
+    words = ["plan", "table1-5", "--experiments", own, "--store", tmp_path / "runs"]
+    settings.write_text(shipped)
+    assert irl(*words).code == 0
+    settings.write_text(f"{shipped}\n[evaluation]\nepisodes = 3\n")
+    done = irl(*words)
+    assert done.code == 2 and "other settings than the shipped table" in done.err
+    assert "--tag NAME" in done.err.splitlines()[-1]
+    assert irl(*words, "--tag", "x").code == 0
