@@ -106,60 +106,43 @@ def intervention_numbers(setting: Setting) -> list[float]:
     return [x for _, value in setting.changes for x in value.numbers]
 
 
-def read_metadata(directory: Path) -> dict[str, Any]:
-    """The key-value metadata of the demonstrations in ``directory``; reads only the footer.
-
-    Raises:
-        IntegrityError: missing, damaged, or written with a newer schema.
-    """
-    path = directory / EPISODES
-    try:
-        with open_table(path) as file:
-            tags = json.loads((file.schema_arrow.metadata or {})[_METADATA_KEY])
-        version, env = tags["schema"], tags["env"]
-        if type(version) is not int or not isinstance(env, str):
-            raise ValueError("malformed metadata")
-    except FileNotFoundError:
-        raise IntegrityError(
-            f"{directory} holds no demonstrations: {EPISODES} is missing"
-        ) from None
-    except UNREADABLE as error:
-        raise IntegrityError(
-            f"{path} is not a demonstrations file ({first_line(error)})",
-            "`irl collect-experts` writes demonstrations",
-        ) from None
-    if version > SCHEMA:
-        raise NewerFormat(str(path), version, SCHEMA)
-    return tags
-
-
 def read_demonstrations(directory: Path) -> Demonstrations:
     """The demonstrations in ``directory``, every trajectory validated.
 
     Raises:
         IntegrityError: missing, damaged, inconsistent, or written with a newer schema.
     """
-    tags = read_metadata(directory)
-    with open_files(directory) as (steps, episodes):
+    with open_files(directory) as (steps, episodes, tags):
         trajectories = _parse(steps.read(), read_episodes(episodes, steps.metadata.num_rows))
     return Demonstrations(tags["env"], trajectories, tags)
 
 
 @contextmanager
-def open_files(directory: Path) -> Iterator[tuple[pq.ParquetFile, pq.ParquetFile]]:
-    """The two files of a dataset, with the columns that they must have; nothing is read yet.
+def open_files(
+    directory: Path,
+) -> Iterator[tuple[pq.ParquetFile, pq.ParquetFile, dict[str, Any]]]:
+    """The two files of a dataset, which have the columns of one, and their key-value metadata.
+
+    No row is read yet.
 
     Raises:
-        IntegrityError: missing or damaged; also for what is raised while they are read.
+        IntegrityError: missing, damaged, or written with a newer schema; also for what is raised
+            while they are read.
     """
     try:
         with (
             open_table(directory / STEPS) as steps,
             open_table(directory / EPISODES, texts=["setting"]) as episodes,
         ):
+            tags = json.loads((episodes.schema_arrow.metadata or {})[_METADATA_KEY])
+            version = tags["schema"]
+            if type(version) is not int or not isinstance(tags["env"], str):
+                raise ValueError("malformed metadata")
+            if version > SCHEMA:
+                raise NewerFormat(str(directory / EPISODES), version, SCHEMA)
             # Before any column is read: these columns cannot be nested or of unlimited width.
             _check_schemas(steps.schema_arrow, episodes.schema_arrow)
-            yield steps, episodes
+            yield steps, episodes, tags
     except FileNotFoundError as error:
         missing = Path(error.filename or STEPS).name
         raise IntegrityError(f"{directory} holds no demonstrations: {missing} is missing") from None
@@ -299,9 +282,7 @@ def column_array(column: pa.ChunkedArray) -> np.ndarray:
     """A column of R numbers or of lists of N numbers as an array [R] or [R, N]."""
     if not pa.types.is_fixed_size_list(column.type):
         return column.to_numpy()
-    size = column.type.list_size
-    parts = [chunk.flatten().to_numpy().reshape(-1, size) for chunk in column.chunks]
-    return np.concatenate(parts) if parts else np.empty((0, size), np.float32)
+    return column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
 
 
 def array_column(array: np.ndarray) -> pa.Array:

@@ -32,9 +32,9 @@ def write_csv(path: Path, frame: Any) -> None:
     frame.to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
 
 
-def write_metrics(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write ``metrics.parquet``: one row per round and setting."""
-    write_table(pa.Table.from_pylist(list(rows)), directory / "metrics.parquet")
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``rows``, which have the same columns, as Parquet."""
+    write_table(pa.Table.from_pylist(list(rows)), path)
 
 
 def write_policy(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -96,9 +97,9 @@ def joined(pieces: Sequence[Steps]) -> Steps:
     if len({piece.rewards is None for piece in pieces}) > 1:
         raise mixed_rewards()
     columns = {
-        name: np.concatenate([getattr(piece, name) for piece in pieces])
-        for name in Steps.__dataclass_fields__
-        if name not in ("rewards", "place")
+        column.name: np.concatenate([getattr(piece, column.name) for piece in pieces])
+        for column in fields(Steps)
+        if column.name not in ("rewards", "place")
     }
     rewards = [piece.rewards for piece in pieces if piece.rewards is not None]
     return Steps(**columns, rewards=np.concatenate(rewards) if rewards else None, place=nowhere)
@@ -202,19 +203,13 @@ class Check:
         Raises:
             UsageError: naming the first step that cannot be used, and why.
         """
-        # Of a part beyond the time limit nothing is left.
-        yield from (part for part in self._each(parts) if len(part))
-
-    def _each(self, parts: Iterable[Steps]) -> Iterator[Steps]:
-        before: Steps | None = None
-        for part in parts:
-            if len(part) == 0:
-                continue
-            if before is not None:
-                yield self._checked(before, bool(part.first[0]))
-            before = part
-        if before is not None:
-            yield self._checked(before, True)
+        closed: Iterator[Steps | None] = chain(parts, [None])
+        for part, following in pairwise(closed):
+            assert part is not None
+            checked = self._checked(part, following is None or bool(following.first[0]))
+            # Of a part beyond the time limit nothing is left.
+            if len(checked):
+                yield checked
 
     def _checked(self, steps: Steps, complete: bool) -> Steps:
         """``steps``; ``complete`` if the last one is the last of its episode."""

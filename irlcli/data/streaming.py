@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -34,20 +34,6 @@ from irlcli.interventions import Setting
 from irlcli.trajectories import Trajectory
 
 
-class Written(NamedTuple):
-    """The episodes of a written dataset.
-
-    Attributes:
-        settings: index of the setting, by episode.
-        lengths: number of steps, by episode.
-        returns: sum of the true rewards, by episode; None if they are unknown.
-    """
-
-    settings: np.ndarray
-    lengths: np.ndarray
-    returns: np.ndarray | None
-
-
 def write_stream(
     directory: Path,
     env: str,
@@ -55,10 +41,10 @@ def write_stream(
     parts: Iterator[Steps],
     metadata: Mapping[str, Any],
     size: int = PIECE,
-) -> Written:
+) -> pa.Table:
     """Write whole episodes as a dataset; a setting's index is its place in ``settings``.
 
-    A row group holds ``size`` steps.
+    A row group holds ``size`` steps. Returns the rows of ``episodes.parquet``.
 
     Raises:
         OSError: the directory cannot be written.
@@ -77,12 +63,10 @@ def write_demonstrations(
 
     Raises:
         OSError: the directory cannot be written.
-        ValueError: no trajectory.
+        UsageError: no trajectory.
     """
     settings = [setting for setting, _ in groups]
     episodes = [(index, t) for index, (_, group) in enumerate(groups) for t in group]
-    if not episodes:
-        raise ValueError("no trajectory to write")
     _write(directory, env, settings, itertools.starmap(_steps, episodes), metadata)
 
 
@@ -109,8 +93,8 @@ def _write(
     settings: Sequence[Setting],
     parts: Iterator[Steps],
     metadata: Mapping[str, Any],
-) -> Written:
-    """Write each of ``parts`` as a row group."""
+) -> pa.Table:
+    """Write each of ``parts`` as a row group; the rows of ``episodes.parquet``."""
     first = next(parts, None)
     if first is None:
         raise UsageError("the recordings hold no episode", "name recordings with episodes")
@@ -125,7 +109,7 @@ def _write(
             file.write_table(table.add(schema, part), row_group_size=max(1, len(part)))
     rows = table.rows(settings, episodes_schema(width, rewarded=rewarded).with_metadata(tags))
     write_table(rows, directory / EPISODES)
-    return table.written()
+    return rows
 
 
 class _EpisodeTable:
@@ -181,12 +165,11 @@ class _EpisodeTable:
             self._open_rewards, begin = [], end + 1
         self._open_rewards.append(rewards[begin:])
 
-    def _columns(self) -> list[np.ndarray]:
-        return [np.concatenate(column) for column in zip(*self._parts, strict=True)]
-
     def rows(self, settings: Sequence[Setting], schema: pa.Schema) -> pa.Table:
         """The rows of ``episodes.parquet``."""
-        places, seeds, lengths, terminated, final = self._columns()
+        places, seeds, lengths, terminated, final = (
+            np.concatenate(column) for column in zip(*self._parts, strict=True)
+        )
         texts = pa.array([str(setting) for setting in settings])
         numbers = pa.array(
             [intervention_numbers(setting) for setting in settings], pa.list_(pa.float64())
@@ -204,11 +187,6 @@ class _EpisodeTable:
         ]
         return pa.Table.from_arrays(columns, schema=schema)
 
-    def written(self) -> Written:
-        """The episodes so far."""
-        places, _, lengths, _, _ = self._columns()
-        return Written(places, lengths, np.array(self._returns) if self._rewarded else None)
-
 
 def read_stream(directory: Path, size: int = PIECE) -> tuple[list[str], Iterator[Steps]]:
     """The settings of the dataset in ``directory``, in order of appearance, and its steps.
@@ -216,9 +194,10 @@ def read_stream(directory: Path, size: int = PIECE) -> tuple[list[str], Iterator
     At most ``size`` steps are read at a time.
 
     Raises:
-        IntegrityError: missing or damaged; also while the steps are read.
+        IntegrityError: missing, damaged, or written with a newer schema; also while the steps are
+            read.
     """
-    with open_files(directory) as (steps, episodes):
+    with open_files(directory) as (steps, episodes, _):
         found = read_episodes(episodes, steps.metadata.num_rows)
     settings = list(dict.fromkeys(found.settings))
     return settings, _stream(directory, found, settings, size)
@@ -232,7 +211,7 @@ def _stream(directory: Path, episodes: Episodes, settings: list[str], size: int)
     stops = np.cumsum(episodes.lengths, dtype=np.int64)
     starts = stops - episodes.lengths
     done, kept = 0, None
-    with open_files(directory) as (file, _):
+    with open_files(directory) as (file, _, _):
         for batch in batches(file, size):
             table = pa.Table.from_batches([batch])
             refuse_nulls(table)

@@ -71,11 +71,9 @@ def request(
 def run(job: Job) -> None:
     """Score every recorded episode by the reward, and compare with the true returns."""
     import numpy as np
-    import pyarrow as pa
     import torch
 
-    from irlcli.data.outputs import write_json
-    from irlcli.data.parquet import write_table
+    from irlcli.data.outputs import write_json, write_rows
     from irlcli.data.tensors import load_reward_file
     from irlcli.report import scatter
     from irlcli.report.assessment import assess
@@ -107,7 +105,7 @@ def run(job: Job) -> None:
     epic, epic_missing = _epic_distances(p.environment, model, origin, episodes)
     assessment = assess(p.environment.name, origin.origin, members, epic, epic_missing)
     write_json(job.output / "assessment.json", msgspec.to_builtins(assessment))
-    write_table(pa.Table.from_pylist(rows), job.output / "bank.parquet")
+    write_rows(job.output / "bank.parquet", rows)
     scatter.draw_bank(job.output, assessment)
 
 

@@ -74,11 +74,10 @@ def request(problem: str, labels: CuedLabelsConfig) -> Request:
 
 def run(job: Job) -> None:
     """Train one method after the other, all seeds of a method side by side."""
-    import pyarrow as pa
     import torch
 
     from irlcli.controls import classifier, cued_labels
-    from irlcli.data.parquet import write_table
+    from irlcli.data.outputs import write_rows
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
@@ -112,7 +111,7 @@ def run(job: Job) -> None:
         ]
 
     rows = run_parts(job, p.methods, rows_of, "methods")
-    write_table(pa.Table.from_pylist(rows), job.output / "accuracy.parquet")
+    write_rows(job.output / "accuracy.parquet", rows)
 
 
 STAGE = Stage("control-labels", 2, run, reads=("control",))

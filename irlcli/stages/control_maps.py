@@ -216,15 +216,14 @@ def request(name: str, chosen: Sequence[Case], maps: CuedMapsConfig) -> Request:
 
 def run(job: Job) -> None:
     """Fit one case after the other; a checkpoint holds the results of those that are done."""
-    import pyarrow as pa
     import torch
 
-    from irlcli.data.parquet import write_table
+    from irlcli.data.outputs import write_rows
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
     rows = run_parts(job, p.cases, lambda case: _rows(case, p.maps), "cases")
-    write_table(pa.Table.from_pylist(rows), job.output / "results.parquet")
+    write_rows(job.output / "results.parquet", rows)
 
 
 def _rows(case: Case, m: CuedMapsConfig) -> list[dict[str, Any]]:

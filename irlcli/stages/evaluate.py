@@ -107,10 +107,8 @@ def act(job: Job, setting: str, policy: Policy | str, noise: float = 0.0) -> lis
 def run(job: Job) -> None:
     """Roll out, and score by the reward if there is one."""
     import numpy as np
-    import pyarrow as pa
 
-    from irlcli.data.outputs import write_json
-    from irlcli.data.parquet import write_table
+    from irlcli.data.outputs import write_json, write_rows
     from irlcli.data.tensors import load_policy_file, load_reward_file
 
     p: Parameters = job.parameters
@@ -151,7 +149,7 @@ def run(job: Job) -> None:
         summary.append(means)
         facts = {text: shown(means["mean_return"], means["mean_progress"])}
         job.console.progress(index + 1, len(p.settings), "settings", facts)
-    write_table(pa.Table.from_pylist(rows), job.output / "episodes.parquet")
+    write_rows(job.output / "episodes.parquet", rows)
     write_json(job.output / "summary.json", document | {"settings": summary})
 
 

@@ -16,10 +16,10 @@ from irlcli.stages.running import means_of
 
 if TYPE_CHECKING:
     import numpy as np
+    import pyarrow as pa
 
     from irlcli.data.exchange.expected import Expected
     from irlcli.data.steps import Irregular, Steps
-    from irlcli.data.streaming import Written
     from irlcli.trajectories import ActionSpace
 
 Form = Literal["parquet", "minari", "imitation"]
@@ -116,12 +116,13 @@ def run(job: Job) -> None:
     expected = Expected(env, p.settings, p.setting_column, horizon, actions, irregular)
     check = Check(horizon, bounds.shape[1], actions, f"{env} {p.settings[0]}", irregular, start)
     parts = _bounded(job, check(_read(job.inputs, p, expected)), bounds, actions)
-    written = write_stream(job.output, env, settings, parts, {"imported": p.form})
-    for index, text in enumerate(p.settings):
-        if not (written.settings == index).any():
+    episodes = write_stream(job.output, env, settings, parts, {"imported": p.form})
+    present = set(episodes["setting"].to_pylist())
+    for text in p.settings:
+        if text not in present:
             raise UsageError(f"no episode is of {text}", "omit settings without demonstrations")
-    _report(job, irregular, written)
-    summary = {"env": env, "settings": [_means(k, t, written) for k, t in enumerate(p.settings)]}
+    _report(job, irregular, episodes)
+    summary = {"env": env, "settings": [_means(text, episodes) for text in p.settings]}
     write_json(job.output / "summary.json", summary)
 
 
@@ -187,7 +188,14 @@ def _spaces(env: str, settings: Sequence[Setting]) -> tuple[np.ndarray, ActionSp
 def _read(inputs: Mapping[str, Path], p: Parameters, expected: Expected) -> Iterator[Steps]:
     from dataclasses import replace
 
-    read = _reader(p.form)
+    from irlcli.data.exchange import imitation, minari, transitions
+
+    readers: dict[Form, Callable[[Path, Expected], Iterator[Steps]]] = {
+        "parquet": transitions.read_transitions,
+        "minari": minari.read_minari,
+        "imitation": imitation.read_imitation,
+    }
+    read = readers[p.form]
     if "source" in inputs:
         yield from read(inputs["source"], expected)
         return
@@ -198,19 +206,8 @@ def _read(inputs: Mapping[str, Path], p: Parameters, expected: Expected) -> Iter
             yield replace(steps, settings=steps.settings + index)
 
 
-def _reader(form: Form) -> Callable[[Path, Expected], Iterator[Steps]]:
-    from irlcli.data.exchange import imitation, minari, transitions
-
-    readers: dict[Form, Callable[[Path, Expected], Iterator[Steps]]] = {
-        "parquet": transitions.read_transitions,
-        "minari": minari.read_minari,
-        "imitation": imitation.read_imitation,
-    }
-    return readers[form]
-
-
-def _report(job: Job, irregular: Irregular, written: Written) -> None:
-    if written.returns is None:
+def _report(job: Job, irregular: Irregular, episodes: pa.Table) -> None:
+    if "return" not in episodes.column_names:
         job.console.warn("the demonstrations hold no true reward: their returns are unknown")
     for count, what in (
         (irregular.long, "longer than the time limit, cut there"),
@@ -218,26 +215,27 @@ def _report(job: Job, irregular: Irregular, written: Written) -> None:
         (irregular.empty, "without steps, left out"),
     ):
         if count:
-            episodes = "episode" if count == 1 else "episodes"
-            job.console.warn(f"{count} {episodes} {what}")
+            job.console.warn(f"{count} {'episode' if count == 1 else 'episodes'} {what}")
     if irregular.terminated and not environment(job.parameters.environment.name).terminates:
         job.console.warn(
-            f"{irregular.terminated} of {len(written.lengths)} episodes are terminated, but no episode of this "
+            f"{irregular.terminated} of {len(episodes)} episodes are terminated, but no episode of this "
             "environment terminates: the absorbing states after their end would tell the expert from "
             "the policy. Write truncated instead"
         )
     elif irregular.terminated_at_limit:
         job.console.warn(
-            f"{irregular.terminated_at_limit} of {len(written.lengths)} episodes are terminated in the last "
+            f"{irregular.terminated_at_limit} of {len(episodes)} episodes are terminated in the last "
             "step that the time limit allows: if the time limit ended them, write truncated instead"
         )
 
 
-def _means(index: int, text: str, written: Written) -> dict[str, Any]:
+def _means(text: str, episodes: pa.Table) -> dict[str, Any]:
     """The means of the episodes in one setting, as ``summary.json`` has them."""
-    mine = written.settings == index
-    returns = None if written.returns is None else written.returns[mine]
-    return means_of(text, returns, written.lengths[mine])
+    import pyarrow.compute as pc
+
+    mine = episodes.filter(pc.equal(episodes["setting"], text))
+    returns = mine["return"].to_numpy() if "return" in mine.column_names else None
+    return means_of(text, returns, mine["length"].to_numpy())
 
 
 STAGE = Stage("import", 1, run, reads=())

@@ -129,11 +129,10 @@ def request(
 def run(job: Job) -> None:
     """Fit all variants and datasets of one penalty side by side, one penalty after the other."""
     import numpy as np
-    import pyarrow as pa
     import torch
 
     from irlcli.data import tensors
-    from irlcli.data.parquet import write_table
+    from irlcli.data.outputs import write_rows
     from irlcli.envs.gridworld import tasks
 
     torch.set_num_threads(1)
@@ -162,7 +161,7 @@ def run(job: Job) -> None:
         {"variant": str(v), **asdict(v), "seed": seed, "reward": reward[r]}
         for r, (v, seed) in enumerate(runs)
     ]
-    write_table(pa.Table.from_pylist(rows), job.output / "rewards.parquet")
+    write_rows(job.output / "rewards.parquet", rows)
     rows = [
         {
             "variant": str(v),
@@ -178,7 +177,7 @@ def run(job: Job) -> None:
         for r, (v, seed) in enumerate(runs)
         for e, text in enumerate(texts)
     ]
-    write_table(pa.Table.from_pylist(rows), job.output / "quality.parquet")
+    write_rows(job.output / "quality.parquet", rows)
 
 
 def _fit(

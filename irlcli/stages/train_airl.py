@@ -188,7 +188,7 @@ def _trained(airl: AIRLConfig, settings: Sequence[str]) -> tuple[str, ...]:
 def run(job: Job) -> None:
     """Alternate policy rounds and discriminator rounds, all settings together."""
     from irlcli.data.descriptions import Selected
-    from irlcli.data.outputs import write_metrics, write_policy, write_reward
+    from irlcli.data.outputs import write_policy, write_reward, write_rows
     from irlcli.learners.scoring import SMALLEST_SCALE
     from irlcli.rl.challengers import Challengers
     from irlcli.rl.loop import Training
@@ -251,7 +251,7 @@ def run(job: Job) -> None:
     if selector is not None:
         selected = Selected(round=selector.best["round"], score=selector.best["score"])
     write_reward(job.output, learner, airl=airl, selected=selected, stopped_after=stopped, **origin)
-    write_metrics(job.output, rows)
+    write_rows(job.output / "metrics.parquet", rows)
 
 
 def _warn_of_rounds(job: Job) -> None:

@@ -53,7 +53,7 @@ def demonstrator(env: str, setting: Setting, config: Config) -> Request:
 
 def run(job: Job) -> None:
     """Train; the metrics hold one row per round with the true return of the ended episodes."""
-    from irlcli.data.outputs import write_metrics, write_policy
+    from irlcli.data.outputs import write_policy, write_rows
     from irlcli.rl.loop import Training
     from irlcli.rl.ppo import PPOTrainer, TrueReward
     from irlcli.rl.worlds import make_worlds
@@ -74,7 +74,7 @@ def run(job: Job) -> None:
         settings=(p.setting,),
         seed=p.seed,
     )
-    write_metrics(job.output, rows)
+    write_rows(job.output / "metrics.parquet", rows)
 
 
 STAGE = Stage("train-expert", 2, run, reads=("expert",))

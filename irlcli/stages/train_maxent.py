@@ -82,7 +82,7 @@ def run(job: Job) -> None:
     import torch
 
     from irlcli.data import descriptions, tensors
-    from irlcli.data.outputs import write_json, write_metrics
+    from irlcli.data.outputs import write_json, write_rows
     from irlcli.envs.gridworld import tasks
 
     torch.set_num_threads(1)
@@ -116,7 +116,7 @@ def run(job: Job) -> None:
     weights = {"reward": torch.as_tensor(reward[0]), **learner.networks.state_dict()}
     tensors.save(job.output / "reward.pt", "tabular-reward", description, weights)
     write_json(job.output / "reward.json", msgspec.to_builtins(description))
-    write_metrics(job.output, _metrics(learner, p.settings))
+    write_rows(job.output / "metrics.parquet", _metrics(learner, p.settings))
     write_json(job.output / "quality.json", {"settings": _quality(p, grid, reward)})
 
 

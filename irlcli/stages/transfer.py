@@ -77,7 +77,7 @@ def request(
 
 def run(job: Job) -> None:
     """Train on g / scale. The true return is in the metrics only: no training or choice uses it."""
-    from irlcli.data.outputs import write_metrics, write_policy
+    from irlcli.data.outputs import write_policy, write_rows
     from irlcli.data.tensors import load_reward_file
     from irlcli.envs.spaces import check_spaces
     from irlcli.rl import algorithm
@@ -141,7 +141,7 @@ def run(job: Job) -> None:
         from_student=student is not None,
         restarts=tuple(training.scores) if isinstance(training, Restarts) else (),
     )
-    write_metrics(job.output, rows)
+    write_rows(job.output / "metrics.parquet", rows)
 
 
 def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:

@@ -14,10 +14,9 @@ from irlcli.data.demonstrations import (
     EPISODES,
     STEPS,
     read_demonstrations,
-    read_metadata,
 )
-from irlcli.data.streaming import write_demonstrations
-from irlcli.errors import IntegrityError
+from irlcli.data.streaming import read_stream, write_demonstrations
+from irlcli.errors import IntegrityError, UsageError
 from irlcli.interventions import parse_settings
 from irlcli.trajectories import Trajectory
 
@@ -133,8 +132,10 @@ def test_a_newer_schema_is_named(tmp_path):
     write(tmp_path)
     rewrite_tags(tmp_path, schema=99)
     with pytest.raises(IntegrityError, match="newer") as caught:
-        read_metadata(tmp_path)
+        read_demonstrations(tmp_path)
     assert "upgrade" in caught.value.hint
+    with pytest.raises(IntegrityError, match="newer"):
+        read_stream(tmp_path)
 
 
 def replace_column(path, name, change):
@@ -208,5 +209,5 @@ def test_reading_starts_no_process(tmp_path, monkeypatch):
 
 
 def test_an_empty_dataset_is_not_written(tmp_path):
-    with pytest.raises(ValueError, match="no trajectory"):
+    with pytest.raises(UsageError, match="no episode"):
         write_demonstrations(tmp_path, "lunar-lander", [(SETTINGS[0], [])], {})

@@ -100,7 +100,7 @@ def test_import_of_export_is_the_same(tmp_path_factory, shapes, actions, rewards
     made = table([episode(rng, n, actions, ends, rewards) for n, ends in shapes])
     pq.write_table(made, base / "source.parquet")
     first, written, _ = imported(base / "first", base / "source.parquet", actions, read=sizes[0])
-    assert written.lengths.tolist() == [n for n, _ in shapes]
+    assert written["length"].to_pylist() == [n for n, _ in shapes]
     names, steps = read_stream(base / "first", sizes[1])
     write_transitions(base / "out.parquet", ENV, names, steps, sizes[2])
     second, _, _ = imported(base / "second", base / "out.parquet", actions, read=sizes[3])
@@ -132,7 +132,7 @@ def test_without_a_reward_no_return_is_known(tmp_path):
     made = table([episode(rng, 3, rewards=False), episode(rng, 4, rewards=False)])
     pq.write_table(made, tmp_path / "a.parquet")
     demos, written, _ = imported(tmp_path / "a", tmp_path / "a.parquet")
-    assert written.returns is None
+    assert "return" not in written.column_names
     assert all(np.isnan(t.episode_return) for g in demos.trajectories.values() for t in g)
     assert "reward" not in pq.read_schema(tmp_path / "a" / "steps.parquet").names
     assert "return" not in pq.read_schema(tmp_path / "a" / "episodes.parquet").names
@@ -278,7 +278,7 @@ def test_a_last_batch_of_steps_that_are_cut_leaves_nothing(tmp_path, read):
     _, written, irregular = imported(
         tmp_path / "out", tmp_path / "a.parquet", cut=True, read=read, write=1, texts=TEXTS[:1]
     )
-    assert written.lengths.tolist() == [3, HORIZON] and irregular.long == 1
+    assert written["length"].to_pylist() == [3, HORIZON] and irregular.long == 1
 
 
 def test_other_observations_and_actions_than_the_environments_are_refused(tmp_path):

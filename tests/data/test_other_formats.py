@@ -329,6 +329,16 @@ def test_a_seed_that_a_dataset_cannot_hold_is_unknown(tmp_path, seed, kept):
     assert only.seed == kept
 
 
+def test_a_setting_that_is_no_text_is_refused(tmp_path):
+    import h5py
+
+    save_minari(tmp_path / "a", [episode(np.random.default_rng(0), 3)])
+    with h5py.File(tmp_path / "a" / "main_data.hdf5", "a") as file:
+        file["episode_0"].attrs["setting"] = np.bytes_(b"\xff\xfe")
+    with pytest.raises(IntegrityError, match="utf-8"):
+        imported(read_minari, tmp_path / "a", tmp_path / "out")
+
+
 @pytest.mark.parametrize("name", ["rewards", "terminations", "truncations"])
 def test_several_numbers_in_a_step_are_refused(tmp_path, name):
     import h5py

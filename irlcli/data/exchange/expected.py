@@ -92,11 +92,19 @@ class Expected:
             )
 
     def shaped(self, actions: np.ndarray) -> np.ndarray:
-        """``actions`` [B], [B, K] or [B, A] in the form that the environment's actions have."""
+        """Recorded ``actions`` [B, ...] in the form that the environment's actions have.
+
+        What does not fit keeps at most two dimensions, and is refused with its row.
+        """
         fitting = (len(actions), *self.actions.shape)
         if actions.size == math.prod(fitting):
             actions = actions.reshape(fitting)
-        return actions if self.actions.discrete else actions.astype(np.float32, copy=False)
+        elif actions.ndim > 2:
+            actions = actions.reshape(len(actions), -1)
+        if self.actions.discrete and actions.dtype.kind in "iub":
+            return actions.astype(np.int64, copy=False)
+        with np.errstate(over="ignore"):
+            return actions.astype(np.float32, copy=False)
 
 
 def vectors(array: np.ndarray) -> np.ndarray:
@@ -104,16 +112,6 @@ def vectors(array: np.ndarray) -> np.ndarray:
     # What overflows becomes infinite, which is refused with its row.
     with np.errstate(over="ignore"):
         return array.reshape(len(array), -1).astype(np.float32, copy=False)
-
-
-def action_array(array: np.ndarray) -> np.ndarray:
-    """Recorded actions [B] or [B, K] as int64 or float32."""
-    if array.ndim > 2:
-        array = array.reshape(len(array), -1)
-    if array.dtype.kind in "iub":
-        return array.astype(np.int64, copy=False)
-    with np.errstate(over="ignore"):
-        return array.astype(np.float32, copy=False)
 
 
 def numbers(column: pa.Array, name: str, place: Locate) -> np.ndarray:

@@ -13,7 +13,6 @@ import pyarrow as pa
 
 from irlcli.data.exchange.expected import (
     Expected,
-    action_array,
     numbers,
     unreadable,
     vectors,
@@ -138,7 +137,7 @@ def _steps(
     rewards = None
     if "rews" in batch.schema.names:
         rewards = numbers(batch.column("rews").flatten(), "rews", place).astype(np.float64)
-    actions = action_array(numbers(batch.column("acts").flatten(), "acts", place))
+    actions = numbers(batch.column("acts").flatten(), "acts", place)
     return Steps(
         first=t == 0,
         settings=np.zeros(len(t), dtype=np.int64),

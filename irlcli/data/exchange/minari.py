@@ -13,14 +13,13 @@ from irlcli.data.demonstrations import intervention_numbers
 from irlcli.data.exchange.expected import (
     SETTING,
     Expected,
-    action_array,
     unreadable,
     vectors,
 )
 from irlcli.data.steps import PIECE, Steps, episodes
 from irlcli.envs.registry import environment
 from irlcli.envs.spec import EnvironmentSpec
-from irlcli.errors import IntegrityError, StageFailed, UsageError
+from irlcli.errors import IntegrityError, IrlError, StageFailed, UsageError
 from irlcli.interventions import Setting
 from irlcli.store import read_json
 
@@ -51,9 +50,26 @@ def read_minari(directory: Path, expected: Expected, size: int = PIECE) -> Itera
         IntegrityError: not a dataset of Minari, or damaged.
         UsageError: spaces other than vectors and indices, or an episode that cannot be used.
     """
+    storage = _open(directory)
+    if storage.FORMAT == "hdf5":
+        found = _from_hdf5(directory / "main_data.hdf5", storage.total_episodes, expected.column)
+    else:
+        found = _from_storage(storage)
+    try:
+        yield from _pieces(directory, found, expected, size)
+    except (MemoryError, IrlError):
+        raise
+    # A crafted file makes h5py and numpy raise almost anything.
+    except Exception as error:
+        raise IntegrityError(unreadable(directory, error), "download the dataset again") from None
+
+
+def _pieces(
+    directory: Path, found: Iterator[_Episode], expected: Expected, size: int
+) -> Iterator[Steps]:
     waiting: dict[int, _Episode] = {}
     count = 0
-    for number, episode in enumerate(_episodes(directory, expected.column)):
+    for number, episode in enumerate(found):
         place = f"{directory} episode {number}"
         lengths = [len(array) for array in episode[:-1]]
         if lengths[1] == 0:
@@ -97,12 +113,11 @@ def _steps(directory: Path, episodes: Mapping[int, _Episode], expected: Expected
         seeds.append(_seed(episode.metadata.get("seed")))
     first = np.zeros(int(lengths.sum()), dtype=bool)
     first[starts] = True
-    actions = action_array(np.concatenate([e.actions for e in found]))
     return Steps(
         first=first,
         settings=np.repeat(settings, lengths),
         observations=vectors(np.concatenate([e.observations[:-1] for e in found])),
-        actions=expected.shaped(actions),
+        actions=expected.shaped(np.concatenate([e.actions for e in found])),
         rewards=np.concatenate([e.rewards for e in found]).astype(np.float64, copy=False),
         next_observations=vectors(np.concatenate([e.observations[1:] for e in found])),
         terminated=np.concatenate([e.terminations for e in found]).astype(bool),
@@ -133,20 +148,6 @@ def _setting(metadata: Mapping[str, Any], expected: Expected, place: str) -> int
 
 def _text(name: Any) -> str:
     return name.decode() if isinstance(name, bytes) else str(name)
-
-
-def _episodes(directory: Path, column: str | None) -> Iterator[_Episode]:
-    """Every episode; a crafted file makes h5py raise almost anything."""
-    storage = _open(directory)
-    try:
-        if storage.FORMAT == "hdf5":
-            yield from _from_hdf5(directory / "main_data.hdf5", storage.total_episodes, column)
-        else:
-            yield from _from_storage(storage)
-    except (MemoryError, GeneratorExit):
-        raise
-    except Exception as error:
-        raise IntegrityError(unreadable(directory, error), "download the dataset again") from None
 
 
 def _from_hdf5(path: Path, episodes: int, column: str | None) -> Iterator[_Episode]:
