@@ -110,6 +110,11 @@ class ClusterOptions(NamedTuple):
             raise UsageError(
                 "--jobs does not limit the jobs of Slurm", "use --array-parallelism instead"
             )
+        if self.cluster == "local" and self.detach:
+            raise UsageError(
+                "--detach does not work with --cluster local",
+                "omit --detach: the command must run until all steps exist",
+            )
         if self.cluster == "local" and of_slurm:
             raise UsageError(
                 f"{of_slurm[0]} needs --cluster slurm",
@@ -137,8 +142,6 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
     from irlcli.experiments.cluster.records import unreadable
     from irlcli.experiments.cluster.slurm import Slurm
 
-    cluster = options.cluster
-    assert cluster is not None
     if importlib.util.find_spec("submitit") is None:
         raise UsageError(
             "--cluster needs the package submitit, which is not installed",
@@ -157,31 +160,28 @@ def open_queue(session: StageSession, options: ClusterOptions) -> "Queue":
         warning,
         _sbatch_options(options.sbatch),
     )
-    return Slurm(resources) if cluster == "slurm" else Local(session.store, resources)
+    return Slurm(resources) if options.cluster == "slurm" else Local(session.store, resources)
 
 
 def _sbatch_options(items: Sequence[str]) -> dict[str, str]:
     """The values of ``--sbatch OPTION=VALUE``, repeated, by name."""
     found: dict[str, str] = {}
-    for name, value in map(_sbatch_option, items):
+    for item in items:
+        name, equals, value = item.partition("=")
+        if name in _SET_BY_IRL:
+            option = _SET_BY_IRL[name]
+            raise UsageError(
+                f"irl sets sbatch's {name} itself", f"use {option}" if option else f"omit {name}"
+            )
+        if not equals or not re.fullmatch(r"[a-z][a-z-]*", name):
+            raise UsageError(
+                f"--sbatch {item!r} is not OPTION=VALUE",
+                "write --sbatch account=NAME, for example",
+            )
         if name in found:
             raise UsageError(f"--sbatch {name} is given twice", f"give {name} once")
         found[name] = value
     return found
-
-
-def _sbatch_option(item: str) -> tuple[str, str]:
-    name, equals, value = item.partition("=")
-    if name in _SET_BY_IRL:
-        option = _SET_BY_IRL[name]
-        raise UsageError(
-            f"irl sets sbatch's {name} itself", f"use {option}" if option else f"omit {name}"
-        )
-    if not equals or not re.fullmatch(r"[a-z][a-z-]*", name):
-        raise UsageError(
-            f"--sbatch {item!r} is not OPTION=VALUE", "write --sbatch account=NAME, for example"
-        )
-    return name, value
 
 
 def _queue_of(session: StageSession, plan: "Plan", options: ClusterOptions) -> "Queue":
@@ -218,11 +218,6 @@ def run_jobs(
     from irlcli.experiments.cluster.submission import JobCommand, Submission
 
     queue = open_queue(session, options)
-    if options.detach and not queue.starts_what_waits:
-        raise UsageError(
-            f"--detach does not work with --cluster {queue.name}",
-            "omit --detach: the command must run until all steps exist",
-        )
     # A job that waits for another process would hold its node idle: it exits and is requeued.
     impatient = ["--no-wait"] if session.wait and queue.starts_what_waits else []
 
@@ -277,7 +272,11 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
     queue = _queue_of(session, plan, options)
     there = queued(plan, queue, session.store)
     # Of the last job of each request.
-    last = {job.identity: r for r in records(session.store, queue.place) for job in r.jobs}
+    last = {
+        submitted.identity: (record, submitted.job)
+        for record in records(session.store, queue.place)
+        for submitted in record.jobs
+    }
     lines: list[dict[str, str | None]] = []
     exist = 0
     for name in plan.tasks:
@@ -291,7 +290,7 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
             lines.append({"name": name, "state": state, "job": there[name].job, "why": why})
             continue
         of = last.get(plan.identities[name]) if step.status in ("RUN", "RESUME") else None
-        failure = None if of is None else of.failure(name)
+        failure = None if of is None else of[0].failure(of[1])
         if failure is not None:
             lines.append({"name": name, "state": "FAILED", "job": None, "why": failure.message})
         else:

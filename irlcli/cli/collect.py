@@ -63,5 +63,4 @@ def collect_experts(
     )
     found = deliver_demonstrations(session, request, name)
     if found is not None:
-        for warning in requested.missed_bars(session, found):
-            session.console.warn(warning)
+        requested.warn_of_missed_bars(session, found)

@@ -135,24 +135,10 @@ class TerminalConsole:
             self._writer = None
 
     def _draw(self, done: int, total: int, detail: str) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-        from rich.table import Column
-
         if self._live is None:
-            self._live = Progress(
-                BarColumn(bar_width=12),
-                TaskProgressColumn(),
-                TextColumn(
-                    "{task.fields[detail]}",
-                    markup=False,
-                    table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"),
-                ),
-                console=Console(stderr=True),
-                transient=True,
-                # On a narrow terminal only the detail shrinks.
-                expand=True,
-            )
+            from rich.progress import BarColumn, TaskProgressColumn
+
+            self._live = live_display(BarColumn(bar_width=12), TaskProgressColumn())
             self._task = self._live.add_task("", total=total, detail=detail)
             self._live.start()
         self._live.update(self._task, completed=done, total=total, detail=detail)
@@ -174,6 +160,18 @@ class TerminalConsole:
             _write(f"\x1b[1;33m{text}\x1b[0m", sys.stderr)
         else:
             _write(text, sys.stderr)
+
+
+def live_display(*columns: Any) -> Any:
+    """Bars on stderr with ``columns`` and details; on a narrow terminal only the details shrink."""
+    from rich.console import Console
+    from rich.progress import Progress, TextColumn
+    from rich.table import Column
+
+    shrinking = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+    details = TextColumn("{task.fields[detail]}", markup=False, table_column=shrinking)
+    console = Console(stderr=True)
+    return Progress(*columns, details, console=console, transient=True, expand=True)
 
 
 def printable(text: str) -> str:

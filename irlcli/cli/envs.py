@@ -1,6 +1,5 @@
 """``irl envs``."""
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -137,20 +136,17 @@ def _check(session: Session, spec: EnvironmentSpec, config: Config) -> None:
         outcomes.append(found)
         if not session.as_json:
             _print(found)
+    checks = [found._asdict() for found in outcomes]
     failed = [found for found in outcomes if found.wrong]
     if session.as_json and not failed:
-        out.print_json("check", {"environment": spec.name, "checks": _as_json(outcomes)})
+        out.print_json("check", {"environment": spec.name, "checks": checks})
     if failed:
         raise StageFailed(
             f"{len(failed)} of {len(outcomes)} checks of {spec.name} failed: "
             f"{'; '.join(found.what for found in failed)}",
             "docs/own-environments.md and docs/extending.md say what is expected",
-            {"checks": _as_json(outcomes)},
+            {"checks": checks},
         )
-
-
-def _as_json(outcomes: Sequence[Any]) -> list[dict[str, Any]]:
-    return [found._asdict() for found in outcomes]
 
 
 def _print(found: Any) -> None:

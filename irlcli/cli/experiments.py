@@ -257,10 +257,10 @@ def run(
             _make_one(session, runner, plan, only)
             return
         warn_of_damage(plan, session.console.warn)
+        command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
         if cluster is None:
-            outcome = _make_all(session, runner, plan, choice, jobs or 1)
+            outcome = _make_all(session, runner, plan, command, jobs or 1)
         else:
-            command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
             ended = cluster_jobs.run_jobs(session, runner, plan, command, options)
             if ended is None:
                 return
@@ -270,7 +270,7 @@ def run(
             for name, found in plan.choices():
                 session.console.say(f"{name}: {found}")
         elif not outcome.interrupted:
-            _report(session, runner, plan, choice, directory, outcome)
+            _report(session, plan, choice, directory, outcome)
     _raise_for(outcome, plan, _JOBS_GO_ON if cluster == "slurm" else _CONTINUE)
     if session.as_json and until is not None:
         counts = {field: len(getattr(outcome, field)) for field in ("existed", "copied", "made")}
@@ -295,12 +295,15 @@ def _make_one(session: StageSession, runner: "Runner", plan: "Plan", only: str) 
 
 
 def _make_all(
-    session: StageSession, runner: "Runner", plan: "Plan", choice: TableChoice, jobs: int
+    session: StageSession,
+    runner: "Runner",
+    plan: "Plan",
+    command: Callable[[str], list[str]],
+    jobs: int,
 ) -> "Outcome":
     from irlcli.cli.jobs import job_display
     from irlcli.experiments.execute import Execution
 
-    command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
     display = job_display(session.console)
     try:
         return Execution(plan, runner, command, jobs, display).run()
@@ -329,7 +332,6 @@ def _expecting(plan: "Plan", command: Callable[[str], list[str]]) -> Callable[[s
 
 def _report(
     session: StageSession,
-    runner: "Runner",
     plan: "Plan",
     choice: TableChoice,
     directory: Path | None,
@@ -343,12 +345,8 @@ def _report(
             # The failures are reported, and they are the reason.
             return
         raise
-    try:
-        artefact = runner.run(request)
-    finally:
-        session.console.close()
     name = choice.report_name(plan.selection.tag)
-    runner.store.set_name(name, artefact)
+    (artefact,) = session.run([request], name)
     if directory is not None:
         copy_outputs(session, artefact, directory, plan.table)
     session.print_artefact(artefact, name)

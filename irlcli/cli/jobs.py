@@ -4,7 +4,7 @@ import re
 import time
 from typing import Any
 
-from irlcli.cli.console import TerminalConsole
+from irlcli.cli.console import TerminalConsole, live_display
 from irlcli.experiments.failures import Failure
 from irlcli.labels import duration
 
@@ -71,23 +71,12 @@ class LiveJobs(PlainJobs):
     """A live display on a terminal: what ended scrolls by above the bars."""
 
     def __init__(self, console: TerminalConsole):
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
+        from rich.progress import BarColumn, TextColumn
         from rich.table import Column
 
         super().__init__(console)
-        self._progress = Progress(
-            TextColumn("{task.fields[name]}", markup=False, table_column=Column(no_wrap=True)),
-            BarColumn(bar_width=12),
-            TextColumn(
-                "{task.fields[detail]}",
-                markup=False,
-                table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"),
-            ),
-            console=Console(stderr=True),
-            transient=True,
-            expand=True,
-        )
+        name = TextColumn("{task.fields[name]}", markup=False, table_column=Column(no_wrap=True))
+        self._progress = live_display(name, BarColumn(bar_width=12))
         self._bars: dict[str, Any] = {}
 
     def begin(self, total: int, done: int) -> None:

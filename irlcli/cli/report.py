@@ -1,6 +1,6 @@
 """``irl report``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ from irlcli.cli.experiments import (
     Seeds,
     TableFile,
 )
-from irlcli.cli.options import Name, Out, sources_of_environment, stage_command
+from irlcli.cli.options import Name, Out, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import (
     check_out,
@@ -26,16 +26,18 @@ from irlcli.cli.table_report import (
 )
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.requests.session import DEFAULT_PROFILE
 from irlcli.requests.tables import TableChoice, open_plan
 from irlcli.store import Artefact
 
+# What every report takes.
+_OF_ALL = ("kind", "refs", "store", "as_json", "debug", "quiet", "wait")
 _FORMS = ("text", "markdown", "latex")
 
 
 @stage_command
 def report(
     session: StageSession,
+    context: typer.Context,
     kind: Annotated[
         str,
         typer.Argument(
@@ -65,16 +67,6 @@ def report(
 
     Examples: irl report returns REF..., irl report table1.
     """
-    options = {
-        "--seeds": seeds,
-        "--methods": methods,
-        "--rows": rows,
-        "--choose-penalty": choose_penalty,
-        "--experiments": file,
-        "--format": form,
-        "--out": directory,
-        "--name": name,
-    }
     if kind not in ("returns", "table2") and refs:
         from irlcli.experiments.tables import REPORTS, load_table
 
@@ -87,10 +79,10 @@ def report(
         case "returns":
             if not refs:
                 raise UsageError("name at least one evaluation", "irl report returns REF...")
-            _refuse(kind, options | _of_stages(session))
+            _refuse(context, kind)
             _returns(session, refs)
         case "table2":
-            _refuse(kind, options | _of_stages(session), "--format")
+            _refuse(context, kind, "form")
             _table2(session, form)
         case _:
             chosen = TableChoice(kind, seeds, methods, rows, choose_penalty, file=file)
@@ -99,25 +91,12 @@ def report(
             _table(session, chosen, name, directory)
 
 
-def _of_stages(session: StageSession) -> dict[str, Any]:
-    """The options of stages that were given, for a report that runs none."""
-    return {
-        "--profile": None if session.profile == DEFAULT_PROFILE else session.profile,
-        "--settings": session.file,
-        "--set": session.overrides or None,
-        # IRL_FROM is about every command, also about those that copy nothing.
-        "--from": session.sources if session.sources != sources_of_environment() else None,
-        "--dry-run": session.dry_run or None,
-        "--workers": None if session.workers == 1 else session.workers,
-        "--tensorboard": session.tensorboard,
-    }
-
-
-def _refuse(kind: str, options: Mapping[str, Any], *allowed: str) -> None:
-    for option, value in options.items():
-        if value is not None and option not in allowed:
-            taken = f"{kind} takes {', '.join(allowed)}" if allowed else f"omit {option}"
-            raise UsageError(f"{kind} takes no {option}", taken)
+def _refuse(context: typer.Context, kind: str, *allowed: str) -> None:
+    """Refuse the options that a report which runs no stage would ignore."""
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        if source and source.name == "COMMANDLINE" and option.name not in (*_OF_ALL, *allowed):
+            raise UsageError(f"{kind} takes no {option.opts[0]}", f"omit {option.opts[0]}")
 
 
 def _table(

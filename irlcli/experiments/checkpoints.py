@@ -2,29 +2,25 @@
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 
 from irlcli.errors import Interrupted
 from irlcli.experiments import provenance
-from irlcli.experiments.signals import stop_requests
-from irlcli.stages.base import Console, Stage
+from irlcli.stages.base import Console
 from irlcli.store import Scratch
 
 
 class StageCheckpoints:
-    """The checkpoints of one attempt at ``stage``.
+    """The checkpoints of one attempt at a stage.
 
     A checkpoint that this program cannot resume is discarded with a warning.
 
     Args:
-        stage: the stage at work.
         scratch: where the checkpoint lies.
         console: receives warnings.
         seconds: least time between two checkpoints [s].
     """
 
-    def __init__(self, stage: Stage, scratch: Scratch, console: Console, seconds: float):
-        self._stage = stage
+    def __init__(self, scratch: Scratch, console: Console, seconds: float):
         self._libraries = provenance.libraries()
         self._clock = provenance.Clock()
         self._earlier: tuple[provenance.Attempt, ...] = ()
@@ -37,7 +33,7 @@ class StageCheckpoints:
         try:
             stored = scratch.load()
             if stored is not None:
-                header, self._state = provenance.decode(stored, stage.name, stage.version)
+                header, self._state = provenance.decode(stored)
                 self._earlier = header.attempts
         except ValueError as error:
             self.discard(str(error))
@@ -66,8 +62,6 @@ class StageCheckpoints:
         if self.stop_requested or now - self._last >= self._seconds:
             header = provenance.Header(
                 schema=provenance.SCHEMA,
-                stage=self._stage.name,
-                stage_version=self._stage.version,
                 libraries=self._libraries,
                 attempts=self.attempts(),
             )
@@ -78,15 +72,11 @@ class StageCheckpoints:
                 "stopped; a checkpoint was written", "run the same command again to resume"
             )
 
-    def listening(self) -> AbstractContextManager[None]:
-        """Let a signal request a stop at the end of the round; a second one stops at once."""
-
-        def handle() -> None:
-            if self.stop_requested:
-                raise KeyboardInterrupt
-            self.stop_requested = True
-            self._console.warn(
-                "stopping at the end of this round or stage (a second signal stops at once)"
-            )
-
-        return stop_requests(handle)
+    def request_stop(self) -> None:
+        """A signal asks to stop at the end of the round; a second one stops at once."""
+        if self.stop_requested:
+            raise KeyboardInterrupt
+        self.stop_requested = True
+        self._console.warn(
+            "stopping at the end of this round or stage (a second signal stops at once)"
+        )

@@ -228,10 +228,8 @@ class Execution:
         self._show_lines()
         if child.process.returncode == 0:
             self._plan.lookup.forget_missing()
-            if self._plan.chooses(child.name):
-                self._plan.refresh()
             if self._plan.step(child.name).status == "HIT":
-                self._finish(child.name)
+                self._take(child.name)
                 self._outcome.made.append(child.name)
                 self._display.done(child.name, time.monotonic() - child.started)
                 return
@@ -254,7 +252,7 @@ class Execution:
         self._display.failed(child.name, why)
 
     def _take(self, name: str) -> None:
-        """Finish a step that another run, or another store, has made."""
+        """Finish a step that exists now; later requests depend on a lambda that it chose."""
         self._finish(name)
         if self._plan.chooses(name):
             self._plan.refresh()

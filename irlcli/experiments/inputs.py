@@ -19,15 +19,18 @@ def source_in(artefact: Artefact, output: str | None) -> Source:
 
 
 def checked(store: Store, source: Source) -> Path:
-    """Where ``source`` lies, after its bytes in ``store`` were compared with their digests.
-
-    A file outside a store is not compared.
+    """Where ``source`` lies, after its bytes were compared with the digests that a key holds.
 
     Raises:
         IntegrityError: the bytes differ.
     """
     artefact = source.artefact
     if artefact is None:
+        # It was hashed when the run was planned, which may be hours ago.
+        if foreign_source(source.path).sha256 != source.sha256:
+            raise IntegrityError(
+                f"{source.path} changed after this run was planned", "run the same command again"
+            )
         return source.path
     if source.path != artefact.directory:
         return store.open(artefact, source.path.relative_to(artefact.directory).as_posix())

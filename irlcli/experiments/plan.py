@@ -1,8 +1,7 @@
 """A table as a list of named steps, and what a store holds of each."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
 
 from irlcli.configs import Config
 from irlcli.data.descriptions import PenaltyChoice
@@ -11,7 +10,7 @@ from irlcli.experiments import figures, rows
 from irlcli.experiments.rows import PHASES, Chosen, RewardRun, Task
 from irlcli.experiments.status import Identities, Lookup, Step, waiting
 from irlcli.experiments.tables import Row, Table
-from irlcli.experiments.variants import ConfigOf, Overridable, config_under, step_name
+from irlcli.experiments.variants import Overridable, config_under, loaded, step_name
 from irlcli.stages import choose_penalty
 from irlcli.stages.base import From, Request
 
@@ -53,23 +52,22 @@ class Plan:
         self.selection = selection
         self.lookup = lookup
         self._load = load
-        self._config_of = _loaded(load)
-        self._under = {v: _cached(config_under(v, load)) for v in table.variants}
+        self._config_of = loaded(load)
+        self._under = {v: config_under(v, load) for v in table.variants}
         self._weighted = {
-            method: _loaded(load, f"airl.penalty_weight={weight!r}")
+            method: loaded(load, [f"airl.penalty_weight={weight!r}"])
             for method, weight in table.penalty_weights.items()
         }
         self.figure: Request | None = None
-        self.tasks: dict[str, Task] = {}
-        self.identities: dict[str, str] = {}
-        self.needs: dict[str, tuple[str, ...]] = {}
-        self.cells: list[Task] = []
         self.refresh()
 
     def refresh(self) -> None:
         """Make the tasks again, from what the store holds now: a lambda may have been chosen."""
         self.lookup.forget_missing()
-        self.tasks, self.needs, self.cells, self.identities = {}, {}, [], {}
+        self.tasks: dict[str, Task] = {}
+        self.identities: dict[str, str] = {}
+        self.needs: dict[str, tuple[str, ...]] = {}
+        self.cells: list[Task] = []
         names: dict[str, str] = {}
         identities = Identities()
         last = PHASES.index(self.selection.until)
@@ -185,18 +183,3 @@ class Plan:
             found = rows.choice_made(self.tasks[name].request, self.lookup)
             if found is not None:
                 yield name, found
-
-
-def _cached(config_of: ConfigOf) -> ConfigOf:
-    @cache
-    def load(env: str, flags: tuple[tuple[str, Any], ...]) -> Config:
-        return config_of(env, dict(flags))
-
-    def cached(env: str, flags: Mapping[str, Any] | None) -> Config:
-        return load(env, tuple((flags or {}).items()))
-
-    return cached
-
-
-def _loaded(load: Overridable, *overrides: str) -> ConfigOf:
-    return _cached(lambda env, flags: load(env, flags, overrides))

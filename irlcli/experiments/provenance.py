@@ -55,8 +55,6 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     """What a checkpoint records about itself."""
 
     schema: int
-    stage: str
-    stage_version: int
     libraries: dict[str, str | None]
     attempts: tuple[Attempt, ...]
 
@@ -66,11 +64,11 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
         return len(head).to_bytes(4, "big") + head + state
 
 
-def decode(data: bytes, stage: str, stage_version: int) -> tuple[Header, bytes]:
+def decode(data: bytes) -> tuple[Header, bytes]:
     """The header and the state of a checkpoint that this program can resume.
 
     Raises:
-        ValueError: another schema, stage, version or libraries; or not a checkpoint.
+        ValueError: another schema or other libraries; or not a checkpoint.
     """
     end = 4 + int.from_bytes(data[:4], "big")
     try:
@@ -80,10 +78,6 @@ def decode(data: bytes, stage: str, stage_version: int) -> tuple[Header, bytes]:
         header = msgspec.json.decode(data[4:end], type=Header)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise ValueError("its header is not readable") from None
-    if (header.stage, header.stage_version) != (stage, stage_version):
-        raise ValueError(
-            f"{header.stage[:40]} {header.stage_version} wrote it, this is {stage} {stage_version}"
-        )
     # Only reports use matplotlib, and they have no checkpoints.
     others = differing({**header.libraries, "matplotlib": libraries()["matplotlib"]})
     if others:

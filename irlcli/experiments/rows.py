@@ -32,7 +32,7 @@ from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
 from irlcli.experiments.variants import ConfigOf
 from irlcli.interventions import Setting, listed_settings
-from irlcli.methods import fields, method
+from irlcli.methods import method
 from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
 from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, has_held_out
 from irlcli.stages import (
@@ -98,11 +98,6 @@ class Chosen(NamedTuple):
 
     candidates: Sequence[float] | Literal["own"]
     lookup: Lookup
-
-    def weight(self, choice: Request) -> float | None:
-        """The lambda that ``choice`` led to; None if it was not made yet."""
-        found = choice_made(choice, self.lookup)
-        return None if found is None else found.chosen
 
 
 def choice_made(choice: Request, lookup: Lookup) -> descriptions.PenaltyChoice | None:
@@ -283,7 +278,7 @@ def _run(
         yield Task(run.name, "rewards", cloned)
         yield from _imitation(_Reward(requests, demos, cloned, run, measures), {})
         return
-    airl = run.config_of(env, fields(run.method, "airl")).airl_of(trained)
+    airl = run.config_of(env, run.method).airl_of(trained)
     basis = {}
     if chosen.candidates and airl.penalty != "none":
         choice = choose_penalty.request(
@@ -296,9 +291,9 @@ def _run(
             run.seed,
         )
         yield from _choice(f"{run.name}.choice", choice)
-        weight = chosen.weight(choice)
-        if weight is not None:
-            airl = msgspec.structs.replace(airl, penalty_weight=weight)
+        made = choice_made(choice, chosen.lookup)
+        if made is not None:
+            airl = msgspec.structs.replace(airl, penalty_weight=made.chosen)
         basis = {"penalty choice": From(choice, "choice.json")}
     learned = train_airl.request(From(demos), env, trained, airl, run.seed, basis)
     yield Task(run.name, "rewards", learned)

@@ -10,9 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from irlcli.errors import Busy, IntegrityError, Interrupted, StageFailed, file_failure
-from irlcli.experiments.inputs import checked, foreign_source, source_in
+from irlcli.errors import Busy, Interrupted, StageFailed, file_failure
+from irlcli.experiments.inputs import checked, source_in
 from irlcli.experiments.introduce import described, other_description
+from irlcli.experiments.signals import stop_requests
 from irlcli.experiments.status import Lookup, Step, key_record
 from irlcli.stages.base import Console, From, Job, Request, Source
 from irlcli.store import Artefact, KeyRecord, Store
@@ -206,15 +207,13 @@ class Runner:
         from irlcli.experiments import provenance
         from irlcli.experiments.checkpoints import StageCheckpoints
 
-        inputs = {role: self._checked(source) for role, source in sources.items()}
+        inputs = {role: checked(self.store, source) for role, source in sources.items()}
         scratch.inputs = [source.sha256 for source in sources.values()]
-        checkpoints = StageCheckpoints(
-            request.stage, scratch, self.console, self.checkpoint_seconds
-        )
+        checkpoints = StageCheckpoints(scratch, self.console, self.checkpoint_seconds)
         self.console.start(request.label, checkpoints.load() is not None, record.key)
         output = scratch.new_output()
         job = Job(request.parameters, inputs, output, checkpoints, self.console, self.workers)
-        with checkpoints.listening():
+        with stop_requests(checkpoints.request_stop):
             try:
                 request.stage.run(job)
             except BaseException as error:
@@ -242,17 +241,6 @@ class Runner:
                 f"stopped after {request.label}", "run the same command again to continue"
             )
         return published.diverged or published.artefact
-
-    def _checked(self, source: Source) -> Path:
-        """The path of an input whose bytes have the digest that the key holds."""
-        foreign = source.artefact is None
-        # It was hashed when the run was planned, which may be hours ago.
-        if foreign and foreign_source(source.path).sha256 != source.sha256:
-            raise IntegrityError(
-                f"{source.path} changed after this run was planned",
-                "run the same command again",
-            )
-        return checked(self.store, source)
 
 
 def _address(source: Source) -> str:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -18,9 +19,9 @@ SECTIONS = ("airl", "transfer")
 _NAME = r"[a-z0-9]+([ -][a-z0-9]+)*"
 _LONGEST = 40
 
-# The config of an environment, under flags such as ``airl.penalty``.
-ConfigOf = Callable[[str, Mapping[str, Any] | None], Config]
-# The same, under overrides as ``--set`` takes them.
+# The config of an environment under a method's flags; without a method, under none.
+ConfigOf = Callable[[str, str | None], Config]
+# The config under flags such as ``airl.penalty``, and under overrides as ``--set`` takes them.
 Overridable = Callable[[str, Mapping[str, Any] | None, Sequence[str]], Config]
 
 
@@ -102,16 +103,28 @@ def step_name(variant: Variant) -> str:
     return variant.name.replace(" ", "-")
 
 
+def loaded(load: Overridable, overrides: Sequence[str] = ()) -> ConfigOf:
+    """The configs under ``overrides``, each loaded once."""
+
+    @cache
+    def config_of(env: str, method: str | None) -> Config:
+        return load(env, None if method is None else fields(method, "airl"), overrides)
+
+    return config_of
+
+
 def config_under(variant: Variant, load: Overridable) -> ConfigOf:
     """The configs under ``variant``.
 
     Challengers learn as ``[transfer.ppo]`` says. Still, what a variant changes in ``transfer``
     leaves reward learning alone: such variants share the rewards of the base.
     """
-    learning = [item for item in variant.overrides if field_of(item).startswith("airl.")]
+    whole = loaded(load, variant.overrides)
+    learning = loaded(load, [o for o in variant.overrides if field_of(o).startswith("airl.")])
 
-    def config_of(env: str, flags: Mapping[str, Any] | None) -> Config:
-        config, learned = load(env, flags, variant.overrides), load(env, flags, learning)
+    @cache
+    def config_of(env: str, method: str | None) -> Config:
+        config, learned = whole(env, method), learning(env, method)
         interventions = {
             knob: msgspec.structs.replace(listed, airl=learned.interventions[knob].airl)
             for knob, listed in config.interventions.items()

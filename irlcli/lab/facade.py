@@ -127,8 +127,7 @@ class Lab:
         options["episodes"] = joined(episodes)
         with self._at_work(configs, words("collect-experts", options)) as session:
             stored = self._run(session, collect.collect_experts(session, **options), name)
-            for warning in collect.missed_bars(session, collect.summary(session, stored._artefact)):
-                session.console.warn(warning)
+            collect.warn_of_missed_bars(session, collect.summary(session, stored._artefact))
             return stored
 
     @plainly

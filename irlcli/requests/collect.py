@@ -1,7 +1,7 @@
 """``collect-experts`` and ``import``: demonstrations."""
 
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from irlcli.configs import Config
@@ -96,14 +96,14 @@ def summary(session: StageSession, artefact: Artefact) -> DemonstrationSummary:
     return output(session.store, artefact, "summary.json", DemonstrationSummary)
 
 
-def missed_bars(session: StageSession, summary: DemonstrationSummary) -> Iterator[str]:
-    """A warning for each expert whose mean true return is below the config's bar."""
+def warn_of_missed_bars(session: StageSession, summary: DemonstrationSummary) -> None:
+    """Warn of each expert whose mean true return is below the config's bar."""
     config = session.config(summary.env)
     for row in summary.settings:
         setting = without_cue(summary.env, parse_setting(summary.env, row.setting))
         bar = config.expert_of(setting).bar
         if bar is not None and row.mean_return is not None and row.mean_return < bar:
-            yield (
+            session.console.warn(
                 f"the expert of {summary.env} {row.setting} is below its bar: mean true return "
                 f"{row.mean_return:.0f} over {row.episodes} episodes, bar {bar:.0f}"
             )

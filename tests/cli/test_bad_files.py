@@ -117,8 +117,6 @@ def test_no_code_in_a_checkpoint_is_run(irl, store_copy, tmp_path, kind):
     (store_copy.path / ".keys" / record.key).unlink()
     header = provenance.Header(
         schema=provenance.SCHEMA,
-        stage=record.stage,
-        stage_version=record.stage_version,
         libraries=provenance.libraries(),
         attempts=(),
     )

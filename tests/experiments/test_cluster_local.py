@@ -260,7 +260,7 @@ def test_a_failure_is_shown_for_its_own_request_only(runs, tmp_path):
         shown = runs.start(*line[:3], *REWARDS, "--status", "--json", *more).communicate()[0]
         return [step["state"] for step in json.loads(shown)["missing"]]
 
-    assert states() == ["FAILED"]
+    assert states() == ["FAILED"] == states("--tag", "other")
     # Also of a step that left a checkpoint, and from another directory's view of the store.
     late = (*line[:5], "--tag", "late", "--until", "experts", "--set", "expert.total_steps=999")
     process = runs.start(*late, "--requeues", "0", IRL_TEST_ROUND="1")

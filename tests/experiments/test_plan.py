@@ -9,6 +9,7 @@ import pytest
 from irlcli.configs import load_config
 from irlcli.experiments.rows import Chosen, RewardRun, comparison
 from irlcli.experiments.tables import Row, Table
+from irlcli.methods import fields
 from irlcli.store import Store
 
 TABLES = """
@@ -281,8 +282,8 @@ def test_further_retrainings_have_seeds_of_their_own():
     )
     row = table.rows[0]
 
-    def configs(env, flags):
-        return load_config(env, "smoke", flags=flags)
+    def configs(env, method):
+        return load_config(env, "smoke", flags=method and fields(method, "airl"))
 
     runs = [RewardRun("erm", "erm", seed, str(row), configs) for seed in table.seeds]
     tasks = comparison(row, table.measures, table.retrainings, runs, configs, Chosen((), None))

@@ -10,8 +10,6 @@ from chains import CHAIN, GRIDWORLD, SMOKE
 
 from irlcli.data.tensors import from_bytes
 from irlcli.experiments import provenance, runner
-from irlcli.stages import train_maxent, transfer
-from irlcli.stages.base import Stage
 from irlcli.store import Store
 from irlcli.store.durable import remove
 from irlcli.store.scratch import Scratch
@@ -27,7 +25,7 @@ def maze_store(tmp_path_factory, run_irl) -> Path:
     return store
 
 
-def first_state(run_irl, store: Path, name: str, line: list[str], stage: Stage) -> dict[str, Any]:
+def first_state(run_irl, store: Path, name: str, line: list[str]) -> dict[str, Any]:
     """The state of the first checkpoint of ``line``, which makes the artefact ``name`` anew."""
     made = Store(store).resolve(name).artefact
     (store / ".keys" / made.manifest.record.key).unlink()
@@ -45,7 +43,7 @@ def first_state(run_irl, store: Path, name: str, line: list[str], stage: Stage) 
         patch.setattr(runner, "Runner", functools.partial(runner.Runner, checkpoint_seconds=0.0))
         done = run_irl([*line, *SMOKE, "--quiet", "--store", str(store)])
     assert done.code == 0, done.err
-    _, state = provenance.decode(saved[0], stage.name, stage.version)
+    _, state = provenance.decode(saved[0])
     return from_bytes(state)
 
 
@@ -53,7 +51,7 @@ def first_state(run_irl, store: Path, name: str, line: list[str], stage: Stage) 
 def transfer_state(smoke_store, copied, tmp_path_factory, run_irl) -> dict[str, Any]:
     """The state of a policy that has been retrained for a round."""
     store = copied(smoke_store.path, tmp_path_factory.mktemp("interrupted") / "runs")
-    return first_state(run_irl, store, smoke_store.transfer, CHAIN[2], transfer.STAGE)
+    return first_state(run_irl, store, smoke_store.transfer, CHAIN[2])
 
 
 @pytest.fixture(scope="session")
@@ -61,4 +59,4 @@ def maxent_state(maze_store, tmp_path_factory, run_irl) -> dict[str, Any]:
     """The state of a gridworld's reward that has been learned for a few iterations."""
     store = tmp_path_factory.mktemp("interrupted") / "mazes"
     shutil.copytree(maze_store, store, symlinks=True)
-    return first_state(run_irl, store, "maxent", GRIDWORLD[1], train_maxent.STAGE)
+    return first_state(run_irl, store, "maxent", GRIDWORLD[1])

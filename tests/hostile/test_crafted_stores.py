@@ -13,8 +13,6 @@ from irlcli.data.tensors import restore, to_bytes
 from irlcli.experiments import provenance
 from irlcli.experiments.circumstances import circumstances
 from irlcli.experiments.facts import left_out
-from irlcli.stages import train_maxent, transfer
-from irlcli.stages.base import Stage
 from irlcli.store import KeyRecord, Store
 from irlcli.store.durable import machine, remove
 
@@ -51,12 +49,10 @@ def unmade(store: Store, ref: str) -> str:
     return key
 
 
-def save_checkpoint(store: Store, key: str, stage: Stage, state: dict, attempts=()) -> None:
-    """Save ``state`` as the checkpoint of ``stage`` for ``key``, with a valid header."""
+def save_checkpoint(store: Store, key: str, state: dict, attempts=()) -> None:
+    """Save ``state`` as the checkpoint for ``key``, with a valid header."""
     header = provenance.Header(
         schema=provenance.SCHEMA,
-        stage=stage.name,
-        stage_version=stage.version,
         libraries=provenance.libraries(),
         attempts=attempts,
     )
@@ -68,7 +64,7 @@ def test_a_discarded_checkpoint_is_no_attempt(irl, store_copy):
     store = Store(store_copy.path)
     key = unmade(store, store_copy.transfer)
     attempts = (provenance.Clock().attempt(),)
-    save_checkpoint(store, key, transfer.STAGE, {"other": torch.ones(1)}, attempts)
+    save_checkpoint(store, key, {"other": torch.ones(1)}, attempts)
     done = irl(*CHAIN[2], *SMOKE, "--store", store.root)
     assert done.code == 0 and "starting over" in done.err
     assert store.resolve(store_copy.transfer).artefact.provenance()["resumed"] == 0
@@ -85,7 +81,7 @@ def changed(state: dict, path: str, value) -> dict:
 def test_the_state_that_the_planted_ones_differ_from_is_resumed(irl, store_copy, transfer_state):
     store = Store(store_copy.path)
     key = unmade(store, store_copy.transfer)
-    save_checkpoint(store, key, transfer.STAGE, transfer_state, (provenance.Clock().attempt(),))
+    save_checkpoint(store, key, transfer_state, (provenance.Clock().attempt(),))
     done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
     assert done.code == 0, done.err
     assert store.resolve(store_copy.transfer).artefact.provenance()["resumed"] == 1
@@ -109,7 +105,7 @@ def test_a_planted_checkpoint_is_named(irl, store_copy, transfer_state, path, va
     """Valid tensors, header and checksum around a state that no stage wrote."""
     store = Store(store_copy.path)
     key = unmade(store, store_copy.transfer)
-    save_checkpoint(store, key, transfer.STAGE, changed(transfer_state, path, value))
+    save_checkpoint(store, key, changed(transfer_state, path, value))
     done = irl(*CHAIN[2], *SMOKE, "--quiet", "--store", store.root)
     assert_refused((done.code, done.out, done.err), 4, key)
     shutil.rmtree(store.root / ".work" / key)
@@ -130,7 +126,7 @@ def test_the_gridworld_state_that_the_planted_ones_differ_from_is_resumed(
 ):
     key = unmade(maze_copy, "maxent")
     attempts = (provenance.Clock().attempt(),)
-    save_checkpoint(maze_copy, key, train_maxent.STAGE, maxent_state, attempts)
+    save_checkpoint(maze_copy, key, maxent_state, attempts)
     done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", maze_copy.root)
     assert done.code == 0, done.err
     assert maze_copy.resolve("maxent").artefact.provenance()["resumed"] == 1
@@ -150,7 +146,7 @@ def test_the_gridworld_state_that_the_planted_ones_differ_from_is_resumed(
 def test_a_planted_gridworld_checkpoint_is_named(irl, maze_copy, maxent_state, path, value):
     key = unmade(maze_copy, "maxent")
     state = changed(maxent_state, path, value)
-    save_checkpoint(maze_copy, key, train_maxent.STAGE, state)
+    save_checkpoint(maze_copy, key, state)
     done = irl(*GRIDWORLD[1], *SMOKE, "--quiet", "--store", maze_copy.root)
     assert_refused((done.code, done.out, done.err), 4, key)
 

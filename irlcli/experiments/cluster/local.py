@@ -17,7 +17,6 @@ from irlcli.store import Store
 class Local:
     """Jobs that run here, at once."""
 
-    name = "local"
     starts_what_waits = False
     lag = 1.0
     # Its jobs' ids are those of this machine's processes.

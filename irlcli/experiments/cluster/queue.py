@@ -15,13 +15,11 @@ class Queue(Protocol):
     """A place that runs jobs.
 
     Attributes:
-        name: as ``--cluster`` takes it.
         place: tells it from other queues whose jobs the same store records.
         starts_what_waits: whether it starts a job by itself when those before it have ended.
         lag: how long after the end of a job its files may be invisible here [s].
     """
 
-    name: str
     starts_what_waits: bool
     lag: float
 

@@ -6,10 +6,10 @@ again.
 
 import json
 import os
-import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +32,7 @@ class Submitted(NamedTuple):
     job: str
 
 
+@dataclass
 class Record:
     """One submission.
 
@@ -41,10 +42,9 @@ class Record:
         jobs: in the order of their submission.
     """
 
-    def __init__(self, directory: Path, place: str, jobs: list[Submitted]):
-        self.directory = directory
-        self.place = place
-        self.jobs = jobs
+    directory: Path
+    place: str
+    jobs: list[Submitted]
 
     @property
     def logs(self) -> Path:
@@ -68,8 +68,10 @@ class Record:
         write_durably(path, json.dumps(value).encode())
         self.jobs += jobs
 
-    def failure(self, name: str) -> Failure | None:
-        """Why the job of a step failed, if it said so."""
+    def failure(self, job: str) -> Failure | None:
+        """Why a job failed, if it said so."""
+        # Another command may call the same step otherwise.
+        name = [submitted.name for submitted in self.jobs if submitted.job == job][-1]
         try:
             return Failure(**json.loads((self.notes / f"{name}.failed").read_bytes()))
         except (FileNotFoundError, ValueError, TypeError):
@@ -184,12 +186,3 @@ def _changed(path: Path) -> float:
         return max(p.stat().st_mtime for p in (path, *path.rglob("*")))
     except FileNotFoundError:
         return time.time()
-
-
-def remove(found: Iterable[Path]) -> None:
-    """Remove what :func:`ended` found."""
-    for path in found:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)

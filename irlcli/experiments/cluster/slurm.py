@@ -31,7 +31,6 @@ class Slurm:
         UsageError: Slurm's commands are missing.
     """
 
-    name = "slurm"
     # Slurm starts what waits for other jobs, whether or not anybody watches.
     starts_what_waits = True
     # An NFS client may not ask its server for 60 s whether a file exists now.

@@ -295,7 +295,7 @@ class Submission:
             # Slurm removed it with the job that it depended on.
             self._lost.add(name)
             return True
-        failure = self._records[name].failure(name)
+        failure = self._records[name].failure(self._ids[name])
         if failure is None and not last:
             return False
         self._lost.add(name)

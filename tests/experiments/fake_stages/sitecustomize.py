@@ -54,8 +54,8 @@ def install():
     for stage in (collect_experts, evaluate, train_airl, train_expert, transfer):
         stage.STAGE = stage.STAGE._replace(run=compute)
     original = checkpoints.StageCheckpoints.__init__
-    checkpoints.StageCheckpoints.__init__ = lambda self, stage, scratch, console, seconds: original(
-        self, stage, scratch, console, 0.0
+    checkpoints.StageCheckpoints.__init__ = lambda self, scratch, console, seconds: original(
+        self, scratch, console, 0.0
     )
 
 
