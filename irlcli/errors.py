@@ -33,8 +33,6 @@ class IrlError(Exception):
 class StageFailed(IrlError):
     """A stage could not finish its work (exit 1)."""
 
-    exit_code = 1
-
 
 class UsageError(IrlError):
     """The request is wrong: an unknown name, value, setting or flag (exit 2)."""
@@ -90,11 +88,13 @@ def imported(what: str, place: str) -> Any:
     Raises:
         StageFailed: it or what it imports is not installed, it has no such name, or it is not Python.
     """
-    from pkgutil import resolve_name
+    from importlib import import_module
+    from operator import attrgetter
 
+    module, _, name = place.partition(":")
     try:
-        return resolve_name(place if ":" in place else f"{place}:")
-    except (ImportError, AttributeError, SyntaxError) as error:
+        found = import_module(module)
+    except (ImportError, SyntaxError) as error:
         hint = (
             "install its package, or name its folder in PYTHONPATH; or correct the registered name"
         )
@@ -108,6 +108,12 @@ def imported(what: str, place: str) -> Any:
         ):
             hint = f"the module imports {error.name}: install that, or correct the import"
         raise StageFailed(f"{what}: {place} cannot be imported ({message})", hint) from error
+    try:
+        return attrgetter(name)(found) if name else found
+    except AttributeError as error:
+        raise StageFailed(
+            f"{what}: {place} cannot be imported ({error})", "correct the registered name"
+        ) from error
 
 
 def file_failure(error: OSError) -> StageFailed:

@@ -72,7 +72,7 @@ class LearnedReward:
             ValueError: arrays of other shapes, indices of no action, or a ``done`` that is neither
                 true nor false.
         """
-        from irlcli.trajectories import ActionSpace, Transitions
+        from irlcli.trajectories import ActionSpace
 
         none = np.empty(0)
         space = ActionSpace(self.discrete, self.action_size, none, none, self.choices)
@@ -85,30 +85,27 @@ class LearnedReward:
                 "is a batch of 1, obs[None]"
             )
         size = len(observations)
-        data = Transitions(
-            observations=observations,
-            actions=np.require(act, kind, ["C", "W"]),
-            next_observations=np.require(next_obs, np.float32, ["C", "W"]),
-            terminated=np.require(done, bool, ["C", "W"]),
-            remaining=np.zeros(size, dtype=np.int64),
-        )
-        wanted = {
-            "obs": (data.observations, (size, self.observation_size)),
-            "act": (data.actions, (size, *space.shape)),
-            "next_obs": (data.next_observations, (size, self.observation_size)),
-            "done": (data.terminated, (size,)),
+        actions = np.require(act, kind, ["C", "W"])
+        steps = {
+            "obs": (observations, (size, self.observation_size)),
+            "act": (actions, (size, *space.shape)),
+            "next_obs": (
+                np.require(next_obs, np.float32, ["C", "W"]),
+                (size, self.observation_size),
+            ),
+            "done": (np.require(done, bool, ["C", "W"]), (size,)),
         }
-        for name, (array, shape) in wanted.items():
+        for name, (array, shape) in steps.items():
             if array.shape != shape:
                 raise ValueError(f"{name} is {list(array.shape)}, not {list(shape)}")
         if self.discrete:
-            truncated = np.asarray(act) != data.actions
-            if (truncated | space.outside(data.actions)).any():
+            truncated = np.asarray(act) != actions
+            if (truncated | space.outside(actions)).any():
                 last = ", ".join(map(str, np.ravel(space.last)))
                 raise ValueError(f"act must hold indices from 0 to {last}")
         if not np.isin(done, (0, 1)).all():
             raise ValueError("done must hold true or false")
-        return self._frozen.of_steps(data)
+        return self._frozen.of_steps(*(array for array, _ in steps.values()))
 
     def check_spaces(self, observation_space: Space, action_space: Space) -> None:
         """Refuse an environment of other observations or actions, before its first step.

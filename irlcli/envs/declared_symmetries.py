@@ -30,13 +30,7 @@ def symmetries(
     """
     place = environment(env).symmetries
     assert place is not None
-    module, _, name = place.partition(":")
-    function = getattr(imported(f"environment {env!r}", module), name, None)
-    if function is None:
-        raise StageFailed(
-            f"{module} has no function {name!r}",
-            f"define {name}(settings), or declare no symmetries",
-        )
+    function = imported(f"environment {env!r}", place)
     arguments = [env_kwargs(env, setting) for setting in settings]
     try:
         found: Any = function(arguments)

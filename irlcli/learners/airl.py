@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from itertools import chain
 from typing import Any
@@ -191,15 +191,17 @@ class AIRL:
 
     def challenger_rewards(self, rollout: Rollout) -> np.ndarray:
         """The rewards [T, N] of a challenger: the current g, bounded as in ``ChallengerConfig``."""
-        data = self.view.of(rollout.transitions(slice(None), self._horizon))
         ceiling = level_of(self._quantiles_of(self.model), self.config.challenger.ceiling)
-        reward = transformed_reward(
-            self.model,
-            data,
-            lambda g: g.clamp(max=ceiling),
-            self.config.fixed_horizon,
-            self.config.challenger.ppo.gamma,
-        )
+        gamma = self.config.challenger.ppo.gamma
+        return self._of_g(rollout, lambda g: g.clamp(max=ceiling), gamma)
+
+    def _of_g(
+        self, rollout: Rollout, transform: Callable[[torch.Tensor], torch.Tensor], gamma: float
+    ) -> np.ndarray:
+        """``transform`` of the current g, see :func:`transformed_reward`, as rewards [T, N]."""
+        data = self.view.of(rollout.transitions(slice(None), self._horizon))
+        fixed = self.config.fixed_horizon
+        reward = transformed_reward(self.model, data, transform, fixed, gamma)
         return reward.numpy().reshape(rollout.terminated.shape)
 
     def update(

@@ -14,7 +14,7 @@ from irlcli.learners.actions import ActionView, Policy
 from irlcli.learners.reward_model import RewardModule
 from irlcli.learners.scoring import episode_reward, level_of
 from irlcli.learners.standalone import StandaloneReward
-from irlcli.trajectories import ActionSpace, Rollout, Trajectory, Transitions, transitions
+from irlcli.trajectories import ActionSpace, Rollout, Trajectory, transitions
 
 
 class FrozenReward:
@@ -76,14 +76,13 @@ class FrozenReward:
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The reward [T, N] of every step; what ``policy`` does elsewhere does not matter."""
         data = rollout.transitions(slice(None), self._horizon)
-        return self.of_steps(data).reshape(rollout.terminated.shape)
+        steps = data.observations, data.actions, data.next_observations, data.terminated
+        return self.of_steps(*steps).reshape(rollout.terminated.shape)
 
-    def of_steps(self, data: Transitions) -> np.ndarray:
-        """The reward [B] float32 of each step of ``data``, as :meth:`rewards` gives it."""
-        parts = data.observations, data.actions, data.next_observations, data.terminated
-        ends = bool(data.terminated.any())
+    def of_steps(self, *steps: np.ndarray) -> np.ndarray:
+        """The reward [B] float32 of observations, actions, successors and terminations [B, ...]."""
         with torch.no_grad():
-            return self.module(*map(torch.as_tensor, parts), ends).numpy()
+            return self.module(*map(torch.as_tensor, steps), bool(steps[-1].any())).numpy()
 
     def g_over_scale(
         self, observations: np.ndarray, actions: np.ndarray, next_observations: np.ndarray

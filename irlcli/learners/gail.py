@@ -15,7 +15,6 @@ from torch.nn.functional import softplus
 
 from irlcli.learners.actions import Policy
 from irlcli.learners.airl import AIRL
-from irlcli.learners.scoring import transformed_reward
 from irlcli.trajectories import Rollout
 
 
@@ -28,11 +27,4 @@ class GAIL(AIRL):
     def rewards(self, rollout: Rollout, policy: Policy) -> np.ndarray:
         """The rewards [T, N] of ``policy`` for its rollout, by the current discriminator."""
         # -log(1 - D) = softplus(g).
-        reward = transformed_reward(
-            self.model,
-            self.view.of(rollout.transitions(slice(None), self._horizon)),
-            softplus,
-            self.config.fixed_horizon,
-            self.config.ppo.gamma,
-        )
-        return reward.numpy().reshape(rollout.terminated.shape)
+        return self._of_g(rollout, softplus, self.config.ppo.gamma)

@@ -95,7 +95,7 @@ class Restarts:
         self._training.run(report, warn)
         return [row | {"kept": row["restart"] == self._index} for row in self.rows]
 
-    def _start(self, index: int, rows: Sequence[Row] = (), state: State | None = None) -> None:
+    def _start(self, index: int, rows: Sequence[Row], state: State | None = None) -> None:
         """Begin restart ``index``, or continue it from ``state`` and its own of ``rows``."""
         self._index = index
         # Before the next one takes its memory.

@@ -131,8 +131,6 @@ def recorded_command(directory: Path, layout: Layout) -> str:
     Without ``--out``: its files lie beside the store, and may be another store's by now. Empty if
     the provenance, which may be damaged, cannot be read.
     """
-    import shlex
-
     kept = []
     try:
         words = iter(read_json(directory / PROVENANCE)["record"]["command"])

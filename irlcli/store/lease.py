@@ -219,41 +219,21 @@ def _remove(path: Path, token: str) -> None:
     remove(aside)
 
 
-class _Heart:
-    """Touches the leases of this process, by a thread that starts with the first one."""
-
-    def __init__(self) -> None:
-        self._tokens: dict[Path, str] = {}
-        self._process = 0
-
-    def add(self, path: Path, token: str) -> None:
-        # A forked child has no threads, and none of its parent's leases.
-        if self._process != os.getpid():
-            self._process, self._tokens = os.getpid(), {}
-            threading.Thread(target=self._beat, args=(self._tokens,), daemon=True).start()
-        self._tokens[path] = token
-
-    def remove(self, path: Path) -> None:
-        self._tokens.pop(path, None)
-
-    def _beat(self, tokens: dict[Path, str]) -> None:
-        while True:
-            time.sleep(HEARTBEAT_SECONDS)
-            for path, token in list(tokens.items()):
-                if _token(path) == token:
-                    with suppress(OSError):
-                        os.utime(path, follow_symlinks=False)
-
-
-_HEART = _Heart()
-
-
 @contextmanager
 def _beating(path: Path, token: str) -> Iterator[None]:
-    _HEART.add(path, token)
+    """Touch the lease of this process as long as it holds it. A forked child has no threads."""
+    ended = threading.Event()
+
+    def beat() -> None:
+        while not ended.wait(HEARTBEAT_SECONDS):
+            if _token(path) == token:
+                with suppress(OSError):
+                    os.utime(path, follow_symlinks=False)
+
+    threading.Thread(target=beat, daemon=True).start()
     try:
         yield
     finally:
-        _HEART.remove(path)
+        ended.set()
         if _token(path) == token:
             path.unlink(missing_ok=True)

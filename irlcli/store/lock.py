@@ -11,11 +11,11 @@ import errno
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from irlcli.errors import Busy
-from irlcli.store.lease import Patience, is_leased, leased
+from irlcli.store.lease import Patience, is_leased, leased, read
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
@@ -47,23 +47,13 @@ def locked(
         try:
             fcntl.flock(descriptor, mode | fcntl.LOCK_NB)
         except BlockingIOError:
-            holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip()
-            (patience or Patience()).meet(holder or "another process")
+            (patience or Patience()).meet(read(lease_of(path)) or "another process")
             fcntl.flock(descriptor, mode)
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
             problem = error.strerror
-        if not shared and problem is None:
-            # For messages only: gc must be able to free a disk that is full.
-            with suppress(OSError):
-                os.ftruncate(descriptor, 0)
-                os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
         yield problem
-        if not shared and problem is None:
-            # Later, others may share the lock, and this process is not to be named for them.
-            with suppress(OSError):
-                os.ftruncate(descriptor, 0)
     finally:
         os.close(descriptor)
 

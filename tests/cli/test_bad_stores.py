@@ -292,9 +292,12 @@ def hold():
     children = []
 
     def holding(path: Path, shared: bool = False) -> int:
+        lock = "locked(Path(sys.argv[1]), shared=True)"
+        if not shared:
+            lock = "exclusive(Path(sys.argv[1]), Patience())"
         script = (
-            "import sys; from pathlib import Path; from irlcli.store.lock import locked\n"
-            f"with locked(Path(sys.argv[1]), shared={shared}):\n"
+            "import sys; from pathlib import Path; from irlcli.store.lease import Patience\n"
+            f"from irlcli.store.lock import exclusive, locked\nwith {lock}:\n"
             "    print('held', flush=True); sys.stdin.read()"
         )
         child = subprocess.Popen(

@@ -16,7 +16,7 @@ from irlcli.data.demonstrations import (
     read_demonstrations,
 )
 from irlcli.data.streaming import read_stream, write_demonstrations
-from irlcli.errors import IntegrityError, UsageError
+from irlcli.errors import IntegrityError, NewerFormat, UsageError
 from irlcli.interventions import parse_settings
 from irlcli.trajectories import Trajectory
 
@@ -131,10 +131,10 @@ def rewrite_tags(directory, **changes):
 def test_a_newer_schema_is_named(tmp_path):
     write(tmp_path)
     rewrite_tags(tmp_path, schema=99)
-    with pytest.raises(IntegrityError, match="newer") as caught:
+    with pytest.raises(NewerFormat) as caught:
         read_demonstrations(tmp_path)
     assert "upgrade" in caught.value.hint
-    with pytest.raises(IntegrityError, match="newer"):
+    with pytest.raises(NewerFormat):
         read_stream(tmp_path)
 
 

@@ -13,7 +13,8 @@ import pytest
 from irlcli.errors import Busy
 from irlcli.store import Artefact, Store
 from irlcli.store.durable import machine
-from irlcli.store.lock import locked
+from irlcli.store.lease import Patience
+from irlcli.store.lock import exclusive, locked
 
 DAY = 86400.0
 
@@ -246,7 +247,7 @@ def test_locks_of_a_group_can_be_taken_by_its_members(tmp_path):
 
 
 def test_no_process_uses_the_store_while_it_is_collected(empty_store):
-    gc_lock = locked(empty_store.root / ".locks" / "gc")
+    gc_lock = exclusive(empty_store.root / ".locks" / "gc", Patience())
     with gc_lock, pytest.raises(Busy) as caught, empty_store.in_use():
         pytest.fail("used the store while gc was changing it")
     assert f"process {os.getpid()}" in caught.value.message and caught.value.hint

@@ -93,7 +93,6 @@ def test_waiting_ends_when_the_lease_ends(empty_store, leases, monkeypatch):
 
 def test_a_lease_is_kept_alive(empty_store, leases, monkeypatch):
     monkeypatch.setattr(lease, "HEARTBEAT_SECONDS", 0.02)
-    monkeypatch.setattr(lease, "_HEART", lease._Heart())
     with empty_store.working_on(KEY, wait=False):
         path = leases / f"{KEY}.claim"
         os.utime(path, (0, 0))

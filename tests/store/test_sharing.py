@@ -378,9 +378,10 @@ def test_a_command_waits_for_gc_to_end(irl, empty_store, publish):
     ready, done = os.pipe()
     pid = os.fork()
     if pid == 0:
-        from irlcli.store.lock import locked
+        from irlcli.store.lease import Patience
+        from irlcli.store.lock import exclusive
 
-        with locked(empty_store.root / ".locks" / "gc"):
+        with exclusive(empty_store.root / ".locks" / "gc", Patience()):
             os.write(done, b"x")
             time.sleep(1.0)
         os._exit(0)
