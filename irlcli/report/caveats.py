@@ -11,7 +11,7 @@ import pandas as pd
 from irlcli.methods import METHODS
 from irlcli.report.agents import IN_DISTRIBUTION, title
 from irlcli.report.compute import IMITATED, Assessments, failed_to_imitate
-from irlcli.report.lineage import evaluations, is_mixed, lineage, origins, short
+from irlcli.report.lineage import is_mixed, lineage, origins, short
 from irlcli.report.parameters import EXPERT_BY_REWARD, Cell, Code, Parameters, has_held_out
 from irlcli.report.statistics import identical_runs
 from irlcli.report.text import percent
@@ -37,7 +37,7 @@ def missing(p: Parameters) -> list[str]:
             for why, agents in reasons.items()
         ]
         if parts:
-            exist = len(evaluations(cells))
+            exist = sum(bool(c.run) for c in cells)
             found.append(
                 f"Missing: {row.name}: {exist} of {len(cells)} evaluations exist. "
                 f"{'. '.join(parts)}."
@@ -212,7 +212,7 @@ def shared_demonstrations(p: Parameters) -> list[str]:
     for row in p.rows:
         cells = [c for c in p.cells_of(row.name) if c.seed is not None and c.run]
         seeds = {c.seed for c in cells}
-        behind = lineage(p, evaluations(cells))
+        behind = lineage(p, cells)
         sets = [i for i in behind if p.runs[i].stage in ("collect-experts", "import")]
         if len(sets) == 1 and len(seeds) > 1:
             rows.append(row.name)
@@ -238,7 +238,7 @@ def mixed(p: Parameters) -> list[str]:
     """Rows whose runs differ in code or library versions."""
     found = []
     for row in p.rows:
-        made = origins(p, evaluations(p.cells_of(row.name)))
+        made = origins(p, p.cells_of(row.name))
         if is_mixed(made):
             parts = [
                 f"commit {_attempts(origin.code)}, libraries {origin.libraries}: {_runs(len(ids))}"

@@ -32,7 +32,7 @@ import pandas as pd
 
 from irlcli.data.descriptions import Assessment, Interval, Measured
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, comparisons
-from irlcli.report.lineage import evaluations, is_mixed, origins
+from irlcli.report.lineage import is_mixed, origins
 from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
 from irlcli.report.reward_quality import Judgement, judge
 from irlcli.report.statistics import compare, holm, paired_p, summarise
@@ -165,7 +165,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
                     "progress": None if math.isnan(progress) else float(progress),
                     "complete": all(c.run for c in planned),
                     "partial": any(not c.run and c.seed in sampled for c in planned),
-                    "mixed": is_mixed(origins(p, evaluations(planned))),
+                    "mixed": is_mixed(origins(p, planned)),
                 }
             )
     return _with_imitation(p, points, pd.DataFrame(found))

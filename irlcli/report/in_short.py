@@ -31,8 +31,7 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
         tested = comparisons[(comparisons["row"] == row.name) & (comparisons["measure"] == measure)]
         first = next(tested[tested["difference"].notna()].itertuples(), None)
         methods = p.methods if first is None else (first.y, first.x)
-        others = BASELINES
-        shown = [means[agent] for agent in (*methods, *others) if agent in means]
+        shown = [means[agent] for agent in (*methods, *BASELINES) if agent in means]
         if not any(method in means for method in methods):
             continue
         verdict = "" if first is None else f" {_verdict(first)}"
@@ -40,16 +39,6 @@ def in_short(p: Parameters, cells: pd.DataFrame, comparisons: pd.DataFrame) -> l
         what = MEASURES[measure].partition(":")[0].lower()
         lines.append(f"{row.name} = {where}, {what}, true return: {'; '.join(shown)}.{verdict}")
     return lines
-
-
-def _p(test: Any) -> str:
-    """Welch's p, and Holm's where other rows make it larger."""
-    adjusted = f", adjusted by Holm {p_value(test.p_welch_holm)}" if _is_adjusted(test) else ""
-    return f"p {p_value(test.p_welch)}{adjusted}"
-
-
-def _is_adjusted(test: Any) -> bool:
-    return p_value(test.p_welch) != p_value(test.p_welch_holm)
 
 
 def _verdict(test: Any) -> str:
@@ -64,8 +53,11 @@ def _verdict(test: Any) -> str:
     if test.p_welch_holm < LEVEL:
         more = "more" if test.difference > 0 else "less"
         claim = f"{x} earns significantly {more} than {y}"
+    p, holm = p_value(test.p_welch), p_value(test.p_welch_holm)
+    # Where other rows make it larger.
+    adjusted = f", adjusted by Holm {holm}" if holm != p else ""
     return (
         f"{claim}: {test.difference:+z.1f} (95 % interval {test.low:z.1f} to {test.high:z.1f}, "
-        f"{_p(test)}). {'Without adjustment, a' if _is_adjusted(test) else 'A'} difference of "
+        f"p {p}{adjusted}). {'Without adjustment, a' if adjusted else 'A'} difference of "
         f"{test.detectable:.1f} would be found with a power of 80 %."
     )

@@ -15,10 +15,10 @@ class Origin(NamedTuple):
     libraries: str
 
 
-def lineage(p: Parameters, ids: Iterable[str]) -> list[str]:
-    """``ids`` and all artefacts behind them, each once, depth first."""
+def lineage(p: Parameters, cells: Sequence[Cell]) -> list[str]:
+    """The ids of the evaluations of ``cells`` that exist, and of all behind them; depth first."""
     found: dict[str, None] = {}
-    pending = list(ids)[::-1]
+    pending = [cell.run for cell in reversed(cells)]
     while pending:
         id16 = pending.pop()
         if id16 in p.runs and id16 not in found:
@@ -27,15 +27,10 @@ def lineage(p: Parameters, ids: Iterable[str]) -> list[str]:
     return list(found)
 
 
-def evaluations(cells: Iterable[Cell]) -> list[str]:
-    """The ids of the evaluations that exist."""
-    return [cell.run for cell in cells if cell.run]
-
-
-def origins(p: Parameters, ids: Iterable[str]) -> dict[Origin, list[str]]:
-    """The runs behind ``ids`` by what they were made with, the largest group first."""
+def origins(p: Parameters, cells: Sequence[Cell]) -> dict[Origin, list[str]]:
+    """The runs behind ``cells`` by what they were made with, the largest group first."""
     groups: dict[Origin, list[str]] = {}
-    for id16 in lineage(p, ids):
+    for id16 in lineage(p, cells):
         run = p.runs[id16]
         groups.setdefault(Origin(run.code, run.libraries), []).append(id16)
     return dict(sorted(groups.items(), key=lambda item: -len(item[1])))

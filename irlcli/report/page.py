@@ -9,7 +9,7 @@ from html import escape
 from irlcli.labels import duration
 from irlcli.report.agents import title
 from irlcli.report.build import Report
-from irlcli.report.lineage import commits, evaluations, lineage
+from irlcli.report.lineage import commits, lineage
 from irlcli.report.parameters import Parameters, bank_picture
 from irlcli.report.tables import REWARD_QUALITY, Table, latex_table, markdown_table
 from irlcli.report.text import number
@@ -51,7 +51,7 @@ def markdown(p: Parameters, report: Report) -> str:
 
 def _made(p: Parameters) -> str:
     # Only runs behind a number that is shown.
-    runs = [p.runs[i] for i in lineage(p, evaluations(p.cells))]
+    runs = [p.runs[i] for i in lineage(p, p.cells)]
     states = {state for run in runs for state in run.code}
     named = sorted({state.commit or "unknown" for state in states})
     dirty = " with uncommitted changes" if any(state.dirty for state in states) else ""

@@ -15,7 +15,7 @@ from irlcli.methods import METHODS
 from irlcli.report import paper
 from irlcli.report.agents import IN_DISTRIBUTION, MEASURES, PROGRESS, beside, own_measure, title
 from irlcli.report.compute import IMITATED, failed_to_imitate
-from irlcli.report.lineage import commits, evaluations, lineage
+from irlcli.report.lineage import commits, lineage
 from irlcli.report.parameters import Parameters, Row, Run
 from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
 from irlcli.report.text import incomplete, number, p_value, percent
@@ -412,7 +412,7 @@ def costs(p: Parameters) -> Table:
     lines = []
     for row in p.rows:
         stages: dict[str, list[Run]] = {}
-        for id16 in lineage(p, evaluations(p.cells_of(row.name))):
+        for id16 in lineage(p, p.cells_of(row.name)):
             stages.setdefault(p.runs[id16].stage, []).append(p.runs[id16])
         for stage, runs in sorted(stages.items()):
             seconds = [r.seconds for r in runs if r.seconds is not None]

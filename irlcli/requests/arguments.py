@@ -1,7 +1,7 @@
 """Text of options as settings, counts and numbers."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
@@ -398,17 +398,3 @@ def warn_of_weight(console: "RunConsole", name: str, config: "AIRLConfig | MaxEn
     """Warn if lambda is 0, which turns off the penalty that ``name`` is called after."""
     if config.penalty != "none" and config.penalty_weight == 0:
         console.warn(f"lambda is 0: {name} learns without its penalty, {config.penalty}")
-
-
-def check_cloning(method: str, options: Mapping[str, Any]) -> None:
-    """Refuse ``options`` about a reward, each None if it is not given, for a method without one.
-
-    Raises:
-        UsageError: one is given; the message names it.
-    """
-    for option, value in options.items():
-        if value is not None:
-            raise UsageError(
-                f"--method {method} takes no {option}: it learns no reward",
-                f"omit {option}; --set clone.epochs=N sets how long it learns",
-            )

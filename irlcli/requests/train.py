@@ -4,6 +4,7 @@ import msgspec
 
 from irlcli.configs.load import unseen_settings
 from irlcli.data import descriptions
+from irlcli.errors import UsageError
 from irlcli.experiments.inputs import source_in
 from irlcli.experiments.references import demonstrations
 from irlcli.interventions import check_tabular, overlap, parse_setting
@@ -47,7 +48,7 @@ def train_airl(
     arguments.check_env(demos, env, known)
     settings = [parse_setting(env, text) for text in texts]
     if method in METHODS and not METHODS[method].learns_reward:
-        options = {
+        of_a_reward = {
             "--grouping": grouping,
             "--penalty": penalty,
             "--penalty-weight": penalty_weight,
@@ -55,7 +56,12 @@ def train_airl(
             "--select": select,
             "--state-only": state_only,
         }
-        arguments.check_cloning(method, options)
+        for option, value in of_a_reward.items():
+            if value is not None:
+                raise UsageError(
+                    f"--method {method} takes no {option}: it learns no reward",
+                    f"omit {option}; --set clone.epochs=N sets how long it learns",
+                )
         return clone_stage.request(source, env, settings, session.config(env), seed)
     flags = {
         **arguments.method_fields("airl", method, grouping, penalty),

@@ -183,7 +183,7 @@ def run_tabular(job: Job) -> None:
 
 
 def _record(job: Job, found: Iterable[list[Trajectory]], metadata: Mapping[str, Any]) -> None:
-    """Write the demonstrations of each setting as they are made."""
+    """Tell of the demonstrations of each setting as they are made, then write them all."""
     from irlcli.data.outputs import write_json
     from irlcli.data.streaming import write_demonstrations
 
