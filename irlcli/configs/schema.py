@@ -189,10 +189,15 @@ class TransferConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class DemonstrationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Episodes per setting, sampled from the stochastic expert unless ``deterministic``."""
+    """Episodes per setting, sampled from the stochastic expert unless ``deterministic``.
+
+    ``full_length``: only episodes that last until the time limit; more are recorded instead of the
+    others. For tasks in which an episode that ends early has failed.
+    """
 
     episodes: Count = 10
     deterministic: bool = False
+    full_length: bool = False
 
 
 class ChallengerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -6,11 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from irlcli.configs import Config, GridworldConfig
 from irlcli.data.descriptions import MOST_EPISODES
 from irlcli.envs.registry import environment
-from irlcli.errors import UsageError
+from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import Setting, check_observed, parse_setting, without_cue
 from irlcli.stages import train_expert
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 _SAVED = ".zip"
 # The role of an input, before the setting.
 _NORMALISER = "normaliser"
+# How often as many episodes as are wanted are recorded to find those of full length.
+_ATTEMPTS = 20
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,6 +35,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     settings: tuple[str, ...]
     episodes: tuple[int, ...]
     deterministic: bool
+    full_length: bool | UnsetType
     seed: int
 
 
@@ -97,7 +101,12 @@ def request(
     if environment(env).tabular:
         tabular = TabularParameters(**shared, gridworld=config.gridworld)
         return Request(TABULAR_STAGE, tabular, {}, label)
-    parameters = Parameters(**shared, deterministic=config.demonstrations.deterministic)
+    recorded = config.demonstrations
+    parameters = Parameters(
+        **shared,
+        deterministic=recorded.deterministic,
+        full_length=recorded.full_length or UNSET,
+    )
     # Experts do not depend on the seed of the sampling: every dataset shares them.
     acting: dict[str, Source | From] = {}
     for s in settings:
@@ -129,30 +138,46 @@ def _check_experts(
 def run(job: Job) -> None:
     """Roll every expert out in its own setting."""
     from irlcli.envs.spaces import check_spaces
-    from irlcli.rl.rollout import roll_out
     from irlcli.store import file_digest
 
     p: Parameters = job.parameters
     env = p.environment.name
     check_spaces(env, [parse_setting(env, text) for text in p.settings])
-    found = (
-        roll_out(
-            env,
-            parse_setting(env, text),
-            _expert(job, text),
-            episodes,
-            p.seed,
-            # Of the setting's own, so that they are the same whatever else the dataset holds.
-            f"{STAGE.name} {text}",
-            p.deterministic,
-        )
-        for text, episodes in zip(p.settings, p.episodes, strict=True)
-    )
+    found = (_episodes(job, text, n) for text, n in zip(p.settings, p.episodes, strict=True))
     metadata = {
         "experts": {text: file_digest(job.inputs[f"expert {text}"]) for text in p.settings},
         "deterministic": p.deterministic,
     }
     _record(job, found, metadata)
+
+
+def _episodes(job: Job, text: str, wanted: int) -> list[Trajectory]:
+    """``wanted`` episodes of the expert of setting ``text``.
+
+    Raises:
+        StageFailed: too few episodes last until the time limit, where only such are wanted.
+    """
+    from irlcli.rl.rollout import roll_out
+
+    p: Parameters = job.parameters
+    env, expert = p.environment.name, _expert(job, text)
+    found: list[Trajectory] = []
+    for attempt in range(_ATTEMPTS):
+        # Of the setting's own, so that they are the same whatever else the dataset holds.
+        purpose = f"{STAGE.name} {text}" + (f" again {attempt}" if attempt else "")
+        setting = parse_setting(env, text)
+        episodes = roll_out(env, setting, expert, wanted, p.seed, purpose, p.deterministic)
+        if not p.full_length:
+            return episodes
+        found += [trajectory for trajectory in episodes if not trajectory.terminated]
+        if len(found) >= wanted:
+            return found[:wanted]
+    raise StageFailed(
+        f"{len(found)} of {_ATTEMPTS * wanted} episodes of the expert in {env} {text} last until the time "
+        f"limit, but {wanted} are wanted",
+        "train the expert for longer, record fewer with --episodes, or omit "
+        "demonstrations.full_length",
+    )
 
 
 def _expert(job: Job, text: str) -> Policy:

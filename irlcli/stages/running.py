@@ -144,7 +144,10 @@ def warn_of_failures(
     other_kind = ""
     if deterministic is not None:
         other = "false" if deterministic else "true"
-        other_kind = f"; see whether fewer do with --set demonstrations.deterministic={other}"
+        other_kind = (
+            f"; see whether fewer do with --set demonstrations.deterministic={other}, or leave them out "
+            "with --set demonstrations.full_length=true"
+        )
     for text, episodes in settings.items():
         early, others = (
             [t.episode_return for t in episodes if t.terminated == ended] for ended in (True, False)

@@ -506,6 +506,34 @@ def test_demonstrations_that_fail_are_compared_with_the_other_kind(bench, sample
     assert f"--set demonstrations.deterministic={other}" in done.err
 
 
+def test_only_demonstrations_of_full_length(bench):
+    """Those that end early are left out, and others are recorded in their place."""
+    bench.edit(bench.module, "reward = 1.0 - abs(self.position)", DERAILED)
+    bench.edit(bench.module, "abs(self.position) > 5.0", "derailed")
+    wanted = (*COLLECT, *ONE, "--episodes", "8", "--json")
+
+    def recorded(*more):
+        done = bench.irl(*wanted, *more)
+        assert done.code == 0, done.err
+        path = json.loads(done.out)["path"]
+        return pq.read_table(f"{path}/episodes.parquet").to_pandas()
+
+    every = recorded()
+    unchanged = recorded("--set", "demonstrations.full_length=false")
+    whole = recorded("--set", "demonstrations.full_length=true")
+    assert 0 < every["terminated"].sum() < 8 and unchanged.equals(every)
+    assert len(whole) == 8 == whole["truncated"].sum() and whole["seed"].is_unique
+    kept = every[~every["terminated"]]
+    assert whole["seed"][: len(kept)].tolist() == kept["seed"].tolist()
+
+
+def test_an_expert_whose_episodes_all_end_early_has_none_of_full_length(irl, tmp_path):
+    line = ["collect-experts", "--env", "lunar-lander", "--intervention", "bounce=0.1"]
+    line += ["--profile", "smoke", "--set", "demonstrations.full_length=true"]
+    done = irl(*line, "--store", tmp_path / "runs")
+    assert done.code == 1 and "0 of 40 episodes" in done.err and "full_length" in done.err, done.err
+
+
 def test_actions_in_other_units_and_a_time_limit_written_as_an_end_are_warned_of(bench):
     made = bench.irl(*COLLECT, *ONE, "--name", "demos")
     assert made.code == 0, made.err
