@@ -88,13 +88,11 @@ def imported(what: str, place: str) -> Any:
     Raises:
         StageFailed: it or what it imports is not installed, it has no such name, or it is not Python.
     """
-    from importlib import import_module
-    from operator import attrgetter
+    from pkgutil import resolve_name
 
-    module, _, name = place.partition(":")
     try:
-        found = import_module(module)
-    except (ImportError, SyntaxError) as error:
+        return resolve_name(place if ":" in place else f"{place}:")
+    except (ImportError, AttributeError, SyntaxError) as error:
         hint = (
             "install its package, or name its folder in PYTHONPATH; or correct the registered name"
         )
@@ -107,13 +105,10 @@ def imported(what: str, place: str) -> Any:
             and not f"{place}:".startswith((f"{error.name}.", f"{error.name}:"))
         ):
             hint = f"the module imports {error.name}: install that, or correct the import"
+        elif line := own_line(error):
+            # The module itself raised it, while it was imported.
+            hint = f"correct {line}"
         raise StageFailed(f"{what}: {place} cannot be imported ({message})", hint) from error
-    try:
-        return attrgetter(name)(found) if name else found
-    except AttributeError as error:
-        raise StageFailed(
-            f"{what}: {place} cannot be imported ({error})", "correct the registered name"
-        ) from error
 
 
 def file_failure(error: OSError) -> StageFailed:

@@ -87,7 +87,7 @@ def test_what_is_registered_with_a_wrong_place(irl, store_copy, monkeypatch, pla
     ):
         done = irl(*line, *common)
         assert done.code == 1 and f"{place} cannot be imported" in done.err
-        assert "correct the registered name" in done.err and "defect" not in done.err
+        assert "PYTHONPATH" in done.err and "defect" not in done.err
 
 
 PENALTY = """\
@@ -114,10 +114,6 @@ def discriminator(samples, options):
         (PENALTY.format("1.5"), "penalty 'wrong' returned float, not a scalar tensor"),
         (PENALTY.format("samples.risks.max() * float('nan')"), "penalty 'wrong' is nan in round 0"),
         (PENALTY.format("samples.risks.detach().max()"), "penalty 'wrong' has no gradient"),
-        (
-            "import math\nX = math.nothing\n",
-            "wrong.py, line 2, raised AttributeError: module 'math'",
-        ),
         (PENALTY.replace("):", ")"), "lab.wrong:discriminator cannot be imported (expected ':'"),
         ("def penalty(samples, options): ...", "has no attribute 'discriminator'"),
         ("from irlcli.penalties import Sample", "cannot import name 'Sample'"),
@@ -139,6 +135,7 @@ def test_a_mistake_in_a_penalty_is_named(irl, lab, store_copy, monkeypatch, code
     [
         (PENALTY.replace("):", ")"), "wrong.py, line 4"),
         ("import nothing_here", "the module imports nothing_here"),
+        ("import math\nX = math.nothing\n", "wrong.py, line 2"),
         ("def penalty(samples, options): ...", "correct the registered name"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Iterable
-from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -138,8 +137,7 @@ def gc(
     """List or delete artefacts that no name depends on, and old job logs."""
     if not grace_days >= 0:
         raise UsageError(f"--grace-days {grace_days} is not a number of days", "write 0 or more")
-    from irlcli.experiments.cluster.records import LOCK
-    from irlcli.store.durable import remove
+    from irlcli.experiments.cluster.records import LOCK, remove
 
     session.check_exists()
     grace = grace_days * _DAY
@@ -148,9 +146,7 @@ def gc(
         with session.store.working_on(LOCK, wait=False, what="a submission of jobs"):
             artefacts, work = session.store.collect(grace)
             submissions = ended_submissions(session, grace)
-            for path in submissions:
-                with suppress(OSError):
-                    remove(path)
+            remove(submissions)
         known: Iterable[Artefact] = artefacts
     else:
         submissions = ended_submissions(session, grace)

@@ -94,8 +94,11 @@ def report(
 def _refuse(context: typer.Context, kind: str, *allowed: str) -> None:
     """Refuse the options that a report which runs no stage would ignore."""
     for option in context.command.params:
-        source = context.get_parameter_source(option.name or "")
-        if source and source.name == "COMMANDLINE" and option.name not in (*_OF_ALL, *allowed):
+        name = option.name or ""
+        given = context.get_parameter_source(name)
+        if name in (*_OF_ALL, *allowed) or given is None or given.name != "COMMANDLINE":
+            continue
+        if context.params.get(name) != option.get_default(context):
             raise UsageError(f"{kind} takes no {option.opts[0]}", f"omit {option.opts[0]}")
 
 

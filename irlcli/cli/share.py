@@ -102,8 +102,8 @@ def _chosen(
     if refs and everything:
         raise UsageError("REF and --all are both given", "give one of them")
     if everything:
-        ids, index = store.ids(), store.index()
-        return list(index.artefacts.values()), sorted(set(ids) - {*index.artefacts, *index.newer})
+        index = store.index()
+        return list(index.artefacts.values()), list(index.damaged)
     if not refs:
         raise UsageError("name artefacts, or give --all", "either REF... or --all")
     return list({artefact.id: artefact for artefact in map(find, refs)}.values()), []
@@ -183,7 +183,8 @@ def _share(
         raise IntegrityError(
             f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, because of "
             f"damaged files: {', '.join(left_out)}",
-            _damaged_there(source),
+            f"remove the damaged ones, which the warnings name, in {source.root}; then compute or push "
+            "them again",
             document,
         )
     if session.as_json:

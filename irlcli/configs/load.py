@@ -250,10 +250,14 @@ def settings_directory() -> Path:
 
 def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """``base`` with the values of ``over``, UNSET included: it also unsets what is merged later."""
-    return {
-        **base,
-        **{n: _merge(base.get(n, {}), v) if isinstance(v, Mapping) else v for n, v in over.items()},
-    }
+    merged = dict(base)
+    for name, value in over.items():
+        if isinstance(value, Mapping):
+            inner = merged.get(name)
+            merged[name] = _merge(inner if isinstance(inner, Mapping) else {}, value)
+        else:
+            merged[name] = value
+    return merged
 
 
 def _as(form: type[Form], tree: Mapping[str, Any]) -> Form:

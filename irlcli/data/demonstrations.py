@@ -106,6 +106,29 @@ def intervention_numbers(setting: Setting) -> list[float]:
     return [x for _, value in setting.changes for x in value.numbers]
 
 
+def _read_metadata(directory: Path) -> dict[str, Any]:
+    """The key-value metadata of the demonstrations in ``directory``; reads only the footer."""
+    path = directory / EPISODES
+    try:
+        with open_table(path) as file:
+            tags = json.loads((file.schema_arrow.metadata or {})[_METADATA_KEY])
+        version, env = tags["schema"], tags["env"]
+        if type(version) is not int or not isinstance(env, str):
+            raise ValueError("malformed metadata")
+    except FileNotFoundError:
+        raise IntegrityError(
+            f"{directory} holds no demonstrations: {EPISODES} is missing"
+        ) from None
+    except UNREADABLE as error:
+        raise IntegrityError(
+            f"{path} is not a demonstrations file ({first_line(error)})",
+            "`irl collect-experts` writes demonstrations",
+        ) from None
+    if version > SCHEMA:
+        raise NewerFormat(str(path), version, SCHEMA)
+    return tags
+
+
 def read_demonstrations(directory: Path) -> Demonstrations:
     """The demonstrations in ``directory``, every trajectory validated.
 
@@ -129,17 +152,13 @@ def open_files(
         IntegrityError: missing, damaged, or written with a newer schema; also for what is raised
             while they are read.
     """
+    # First: a newer schema may have other columns.
+    tags = _read_metadata(directory)
     try:
         with (
             open_table(directory / STEPS) as steps,
             open_table(directory / EPISODES, texts=["setting"]) as episodes,
         ):
-            tags = json.loads((episodes.schema_arrow.metadata or {})[_METADATA_KEY])
-            version = tags["schema"]
-            if type(version) is not int or not isinstance(tags["env"], str):
-                raise ValueError("malformed metadata")
-            if version > SCHEMA:
-                raise NewerFormat(str(directory / EPISODES), version, SCHEMA)
             # Before any column is read: these columns cannot be nested or of unlimited width.
             _check_schemas(steps.schema_arrow, episodes.schema_arrow)
             yield steps, episodes, tags

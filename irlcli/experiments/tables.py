@@ -144,21 +144,19 @@ def check_names(tables: Iterable[Table]) -> None:
     """
     first: dict[tuple[str, Row, str], tuple[str, Any]] = {}
     for table in tables:
-        own = table.settings
-        scope = "" if own is None else table.name
-        parts = [] if own is None else [("", own.read_bytes(), "other settings", "")]
+        scope = "" if table.settings is None else table.name
         for row in table.rows:
-            for name, config, differs, hint in (*parts, *_identified(table)):
+            for name, config, differs, hint in _identified(table):
                 other, same = first.setdefault((scope, row, name), (table.name, config))
                 if same != config:
-                    part = f"{name} in {row}" if name else str(row)
                     than = "the shipped table of that name" if other == table.name else repr(other)
+                    instead = (
+                        "rename the table" if scope else f"write settings = FILE in [{table.name}]"
+                    )
                     raise UsageError(
-                        f"{table.name!r} has {part} with {differs} than {than}, so different "
-                        "results would have one name",
-                        f"give the table another name{hint and f', or {hint}'}"
-                        if scope
-                        else f"write settings = FILE in [{table.name}], or {hint}",
+                        f"{table.name!r} has {name} in {row} with {differs} than {than}, so "
+                        "different results would have one name",
+                        f"{instead}, or {hint}",
                     )
 
 

@@ -85,10 +85,24 @@ def check_tag(session: StageSession, choice: TableChoice, table: "Table") -> Non
             "add --tag NAME",
         )
     if choice.file is not None and choice.tag is None:
+        shipped = load_tables()
         try:
-            check_names([*load_tables().values(), table])
+            _check_settings(table, shipped.get(table.name))
+            check_names([*shipped.values(), table])
         except UsageError as error:
             raise UsageError(error.message, f"add --tag NAME, or {error.hint}") from None
+
+
+def _check_settings(table: "Table", shipped: "Table | None") -> None:
+    """Refuse settings that differ from those of the ``shipped`` table of the same name."""
+    if shipped is None or table.settings is None or shipped.settings is None:
+        return
+    if table.settings.read_bytes() != shipped.settings.read_bytes():
+        raise UsageError(
+            f"{table.name!r} has other settings than the shipped table of that name, so different "
+            "results would have one name",
+            "rename the table",
+        )
 
 
 def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] = ()) -> "Plan":

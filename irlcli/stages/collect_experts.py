@@ -169,7 +169,7 @@ def _episodes(job: Job, text: str, wanted: int) -> list[Trajectory]:
         episodes = roll_out(env, setting, expert, wanted, p.seed, purpose, p.deterministic)
         if not p.full_length:
             return episodes
-        found += [trajectory for trajectory in episodes if not trajectory.terminated]
+        found += [t for t in episodes if len(t) == p.environment.max_episode_steps]
         if len(found) >= wanted:
             return found[:wanted]
     raise StageFailed(

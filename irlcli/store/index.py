@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,11 +17,18 @@ class Index:
     Args:
         artefacts: artefacts with sound manifests, by id.
         newer: manifests of a newer schema, as bytes, by id.
+        damaged: ids of artefacts whose manifests are damaged, in a store that is only read.
     """
 
-    def __init__(self, artefacts: Mapping[str, Artefact], newer: Mapping[str, bytes]):
+    def __init__(
+        self,
+        artefacts: Mapping[str, Artefact],
+        newer: Mapping[str, bytes],
+        damaged: Sequence[str] = (),
+    ):
         self.artefacts = dict(artefacts)
         self.newer = dict(newer)
+        self.damaged = tuple(damaged)
 
     @cached_property
     def _holders(self) -> dict[str, list[str]]:

@@ -81,7 +81,7 @@ def is_locked(path: Path) -> bool:
     if not path.exists():
         return False
     try:
-        # A shared lock: the probe must not be mistaken for a holder, nor write its name.
+        # A shared lock: the probe must not be mistaken for a holder.
         with locked(path, shared=True):
             return False
     except Busy:

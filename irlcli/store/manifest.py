@@ -182,6 +182,11 @@ def read_manifest(directory: Path) -> Manifest:
 
 
 def _parse_manifest(value: Any) -> Manifest:
+    expected = {"schema", "stage", "stage_version", "parameters", "inputs", "outputs"}
+    if not isinstance(value, dict) or set(value) != expected:
+        raise ValueError(f"its keys are not {', '.join(sorted(expected))}")
+    if type(value["schema"]) is not int or value["schema"] != SCHEMA:
+        raise ValueError(f"schema {value['schema']!r} is unknown")
     if not isinstance(value["stage"], str) or type(value["stage_version"]) is not int:
         raise ValueError("stage or stage_version has the wrong type")
     if not value["stage"].isprintable():
@@ -192,7 +197,11 @@ def _parse_manifest(value: Any) -> Manifest:
         if not is_sha256(sha):
             raise ValueError(f"input {role!r} is not a sha256")
     outputs = []
+    if not isinstance(value["outputs"], list):
+        raise ValueError("outputs is not a list")
     for item in value["outputs"]:
+        if set(item) != {"path", "size", "sha256"}:
+            raise ValueError("the keys of an output are not path, size, sha256")
         if type(item["size"]) is not int or item["size"] < 0:
             raise ValueError(f"output {item['path']!r} has no size")
         if not is_sha256(item["sha256"]):
@@ -211,15 +220,16 @@ def check_output_path(path: Any) -> str:
         ValueError: empty, absolute, too long, with ``..``, a backslash or unprintable
             characters, or reserved.
     """
-    if (
-        not isinstance(path, str)
-        or not path.isprintable()
-        or "\\" in path
-        or len(path.encode()) > _MAX_PATH_BYTES
-        or not {"", ".", ".."}.isdisjoint(path.split("/"))
-        or path in (MANIFEST, PROVENANCE)
-    ):
-        raise ValueError(f"output path {str(path)[:40]!r} is not allowed")
+    if not isinstance(path, str) or not path or "\\" in path or "\0" in path:
+        raise ValueError(f"output path {path!r} is not allowed")
+    if len(path.encode("utf-8", "replace")) > _MAX_PATH_BYTES or not path.isprintable():
+        raise ValueError(
+            f"output path {path[:40]!r} is too long or contains unprintable characters"
+        )
+    if not {"", ".", ".."}.isdisjoint(path.split("/")):
+        raise ValueError(f"output path {path!r} is not allowed")
+    if path in (MANIFEST, PROVENANCE):
+        raise ValueError(f"output path {path!r} is reserved")
     return path
 
 

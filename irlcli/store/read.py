@@ -128,7 +128,7 @@ def index(layout: Layout, warn: Callable[[str], None]) -> Index:
     Raises:
         IntegrityError: as :func:`get`, unless the store is read-only.
     """
-    artefacts, newer = {}, {}
+    artefacts, newer, damaged = {}, {}, []
     for id16 in ids(layout):
         try:
             artefacts[id16] = get(layout, id16)
@@ -141,8 +141,9 @@ def index(layout: Layout, warn: Callable[[str], None]) -> Index:
         except IntegrityError as error:
             if not layout.read_only:
                 raise
+            damaged.append(id16)
             warn(f"skipping an artefact of the store {layout.root}: {error.message}")
-    return Index(artefacts, newer)
+    return Index(artefacts, newer, damaged)
 
 
 def _size_problem(artefact: Artefact) -> str | None:

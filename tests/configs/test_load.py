@@ -385,6 +385,13 @@ def test_a_wrong_file_is_named_with_the_field(toml, text, named, hint):
     assert hint in error.hint
 
 
+def test_a_table_in_place_of_a_value_that_the_profile_sets_is_named(toml):
+    path = toml("[airl]\npenalty_weight = {a = 1}")
+    assert load_config(LANDER).airl.penalty_weight == 1.0
+    error = refused(files=[path])
+    assert str(path) in error.message and "airl.penalty_weight" in error.message
+
+
 def test_the_layer_at_fault_is_named_not_an_innocent_one(toml):
     """A file may complete what it overrides only in part."""
     path = toml("[interventions.engine-power]\nood = ['2x']")

@@ -136,6 +136,10 @@ def test_a_newer_schema_is_named(tmp_path):
     assert "upgrade" in caught.value.hint
     with pytest.raises(NewerFormat):
         read_stream(tmp_path)
+    # It may have other files.
+    (tmp_path / STEPS).unlink()
+    with pytest.raises(NewerFormat):
+        read_demonstrations(tmp_path)
 
 
 def replace_column(path, name, change):

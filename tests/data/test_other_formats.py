@@ -365,7 +365,7 @@ def test_no_environment_is_made_to_find_the_spaces(tmp_path):
         imported(read_minari, tmp_path / "a", tmp_path / "out")
 
 
-@pytest.mark.parametrize("damage", ["truncated", "text", "metadata", "missing"])
+@pytest.mark.parametrize("damage", ["truncated", "text", "metadata", "missing", "count"])
 def test_a_damaged_dataset_of_minari_is_refused(tmp_path, damage):
     save_minari(tmp_path / "a", [episode(np.random.default_rng(0), 30) for _ in range(5)])
     data, metadata = tmp_path / "a" / "main_data.hdf5", tmp_path / "a" / "metadata.json"
@@ -378,5 +378,9 @@ def test_a_damaged_dataset_of_minari_is_refused(tmp_path, damage):
             metadata.write_text("{")
         case "missing":
             data.unlink()
+        case "count":
+            found = json.loads(metadata.read_text())
+            del found["total_episodes"]
+            metadata.write_text(json.dumps(found))
     with pytest.raises(IntegrityError):
         imported(read_minari, tmp_path / "a", tmp_path / "out")

@@ -519,11 +519,10 @@ def test_only_demonstrations_of_full_length(bench):
         return pq.read_table(f"{path}/episodes.parquet").to_pandas()
 
     every = recorded()
-    unchanged = recorded("--set", "demonstrations.full_length=false")
     whole = recorded("--set", "demonstrations.full_length=true")
-    assert 0 < every["terminated"].sum() < 8 and unchanged.equals(every)
-    assert len(whole) == 8 == whole["truncated"].sum() and whole["seed"].is_unique
-    kept = every[~every["terminated"]]
+    assert 0 < every["terminated"].sum() < 8
+    assert len(whole) == 8 and set(whole["length"]) == {50} and whole["seed"].is_unique
+    kept = every[every["length"] == 50]
     assert whole["seed"][: len(kept)].tolist() == kept["seed"].tolist()
 
 

@@ -71,6 +71,14 @@ def test_a_damaged_manifest_there_leaves_the_others(irl, store, chain, place, tm
     assert refused.code == 4 and f"hint: remove the artefact in {place}" in refused.err
 
 
+def test_an_unfinished_push_there_is_no_damage(irl, store, chain, url, tmp_path):
+    push(store, url, *chain.values())
+    memory().rm(at(url, chain["airl"], "manifest.json"))
+    pulled = irl("pull", "--all", "--from", url, "--store", tmp_path / "other")
+    assert pulled.code == 0, pulled.err
+    assert set(other(tmp_path).ids()) == {chain["expert"].id, chain["demos"].id}
+
+
 @pytest.mark.parametrize("place", ["directory", "memory"], indirect=True)
 def test_an_artefact_of_a_newer_schema_there_is_listed_as_such(irl, store, chain, place):
     push(store, place, *chain.values())

@@ -51,11 +51,12 @@ def read_minari(directory: Path, expected: Expected, size: int = PIECE) -> Itera
         UsageError: spaces other than vectors and indices, or an episode that cannot be used.
     """
     storage = _open(directory)
-    if storage.FORMAT == "hdf5":
-        found = _from_hdf5(directory / "main_data.hdf5", storage.total_episodes, expected.column)
-    else:
-        found = _from_storage(storage)
     try:
+        if storage.FORMAT == "hdf5":
+            data, count = directory / "main_data.hdf5", storage.total_episodes
+            found = _from_hdf5(data, count, expected.column)
+        else:
+            found = _from_storage(storage)
         yield from _pieces(directory, found, expected, size)
     except (MemoryError, IrlError):
         raise

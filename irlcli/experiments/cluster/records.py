@@ -6,8 +6,9 @@ again.
 
 import json
 import os
+import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -186,3 +187,12 @@ def _changed(path: Path) -> float:
         return max(p.stat().st_mtime for p in (path, *path.rglob("*")))
     except FileNotFoundError:
         return time.time()
+
+
+def remove(found: Iterable[Path]) -> None:
+    """Remove what :func:`ended` found."""
+    for path in found:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
