@@ -92,7 +92,7 @@ def report(
 
 
 def _refuse(context: typer.Context, kind: str, *allowed: str) -> None:
-    """Refuse the options that a report which runs no stage would ignore."""
+    """Refuse options that the report would ignore, because it runs no stage."""
     for option in context.command.params:
         name = option.name or ""
         given = context.get_parameter_source(name)

@@ -144,9 +144,9 @@ def read_demonstrations(directory: Path) -> Demonstrations:
 def open_files(
     directory: Path,
 ) -> Iterator[tuple[pq.ParquetFile, pq.ParquetFile, dict[str, Any]]]:
-    """The two files of a dataset, which have the columns of one, and their key-value metadata.
+    """The two files of a dataset and their key-value metadata.
 
-    No row is read yet.
+    Their columns are checked, but no row is read.
 
     Raises:
         IntegrityError: missing, damaged, or written with a newer schema; also for what is raised

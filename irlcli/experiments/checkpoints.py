@@ -73,7 +73,7 @@ class StageCheckpoints:
             )
 
     def request_stop(self) -> None:
-        """A signal asks to stop at the end of the round; a second one stops at once."""
+        """Stop at the end of the round; a second request stops at once."""
         if self.stop_requested:
             raise KeyboardInterrupt
         self.stop_requested = True

@@ -252,7 +252,7 @@ class Execution:
         self._display.failed(child.name, why)
 
     def _take(self, name: str) -> None:
-        """Finish a step that exists now; later requests depend on a lambda that it chose."""
+        """Finish a step that exists now. If it chose a lambda, later requests change."""
         self._finish(name)
         if self._plan.chooses(name):
             self._plan.refresh()

@@ -272,7 +272,8 @@ def _table(name: str, value: Any, defaults: _Defaults, directory: Path) -> Table
     settings = None if listed.settings is UNSET else directory / listed.settings
     if settings is not None and not settings.is_file():
         raise UsageError(
-            f"{name}.settings: {settings} is not a file", f"a path relative to {directory}"
+            f"{name}.settings: {settings} is not a file",
+            f"name a file; relative paths begin in {directory}",
         )
     profiled = next((p for p in PROFILES if f"-{name}".endswith(f"-{p}")), None)
     if settings is not None and profiled is not None:

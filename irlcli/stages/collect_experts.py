@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _SAVED = ".zip"
 # The role of an input, before the setting.
 _NORMALISER = "normaliser"
-# How often as many episodes as are wanted are recorded to find those of full length.
+# To find episodes of full length, at most so many times the wanted number are recorded.
 _ATTEMPTS = 20
 
 
@@ -208,7 +208,7 @@ def run_tabular(job: Job) -> None:
 
 
 def _record(job: Job, found: Iterable[list[Trajectory]], metadata: Mapping[str, Any]) -> None:
-    """Tell of the demonstrations of each setting as they are made, then write them all."""
+    """Report each setting's demonstrations as they are made, then write them all."""
     from irlcli.data.outputs import write_json
     from irlcli.data.streaming import write_demonstrations
 

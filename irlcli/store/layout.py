@@ -138,7 +138,7 @@ def check(layout: Layout) -> None:
             return check(layout)
         raise IntegrityError(
             f"{root} contains files but is not a store",
-            "name a store, or an empty or new directory",
+            "name a store" if layout.read_only else "name a store, or an empty or new directory",
         )
     for name in (*_OWN, _JOBS):
         if (root / name).is_symlink():
