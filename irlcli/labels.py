@@ -141,6 +141,7 @@ def learned(config: Mapping[str, Any]) -> str:
         _averaged(config),
         "to a plateau" if config.get("plateau_rounds") else None,
         "with symmetries" if config.get("symmetries") else None,
+        "with a shared absorbing state" if config.get("shared_absorbing") else None,
         _challenged(challenger) if isinstance(challenger, dict) else None,
     ]
     listed = ", ".join(filter(None, more))

@@ -131,6 +131,7 @@ def relevant_airl(airl: AIRLConfig, discrete_actions: bool, terminates: bool = T
     if not airl.shaping and airl.policy_reward == "g":
         airl = replace(airl, policy_reward="f")
     airl = _symmetric(airl)
+    airl = _absorbing(airl, terminates)
     airl = _challenger(airl, discrete_actions)
     airl = _replay(airl)
     ppo = relevant_ppo(airl.ppo, discrete_actions, "airl.ppo")
@@ -207,6 +208,18 @@ def _symmetric(airl: AIRLConfig) -> AIRLConfig:
         raise UsageError(
             "airl.symmetries needs airl.logit = f: log pi of an image is not log pi of the sample",
             "--set airl.logit=f, or --set airl.symmetries=none",
+        )
+    return airl
+
+
+def _absorbing(airl: AIRLConfig, terminates: bool) -> AIRLConfig:
+    if not airl.shared_absorbing or not airl.fixed_horizon or not terminates:
+        return replace(airl, shared_absorbing=UNSET)
+    if airl.shaping:
+        raise UsageError(
+            "airl.shared_absorbing needs airl.shaping = false: the potential of an absorbing state "
+            "that all share is not defined",
+            "--set airl.shaping=false, or omit airl.shared_absorbing",
         )
     return airl
 

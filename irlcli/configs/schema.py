@@ -43,6 +43,7 @@ UNSET_MEANS: dict[str, Any] = {
     "averaged_rounds": 1,
     "averaged_by": "rounds",
     "symmetries": False,
+    "shared_absorbing": False,
     "penalty_warmup_iterations": 0,
 }
 
@@ -277,6 +278,10 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             not counted (:mod:`irlcli.learners.stopping`). Unset: training takes all steps.
         symmetries: the discriminator sees images of its samples under the environment's symmetries, see
             :mod:`irlcli.learners.images`.
+        shared_absorbing: every episode that ends early continues in the same absorbing state, which
+            the reward knows by an input of its own (Kostrikov et al. 2019). Otherwise in one that keeps
+            the final observation, so that the reward can tell a landing from a crash. Needs
+            ``shaping = false``.
         select: the round that is kept: ``last``, the best on held-out ``episodes``, or the best in
             one setting (``leg-length=1x``), which is left out of training. Scored every
             ``select_every`` rounds, a setting over ``select_episodes``.
@@ -328,6 +333,7 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     averaged_by: Averaged | UnsetType = UNSET
     plateau_rounds: Count | UnsetType = UNSET
     symmetries: bool | UnsetType = UNSET
+    shared_absorbing: bool | UnsetType = UNSET
 
 
 class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -54,6 +54,7 @@ class RewardNetwork(
     columns: Columns = ()
     choices: Annotated[tuple[Size, ...], Meta(max_length=4096)] = ()
     members: Members = 1
+    shared_absorbing: bool = False
 
 
 class Selected(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

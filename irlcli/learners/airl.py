@@ -131,6 +131,7 @@ class AIRL:
             "shaping": config.shaping,
             "columns": config.columns or (),
             "choices": actions.choices,
+            "shared_absorbing": config.shared_absorbing or False,
         }
         members = config.averaged_rounds or 1
         self.network = RewardNetwork(**shape, members=members)

@@ -37,10 +37,12 @@ class Images:
         if self._group is None:
             return batch
         elements = self._drawn(batch.terminated.shape, generator)
+        # What follows the action tells absorbing states apart.
+        action, other = batch.actions.tensor_split([self._actions.shape[-1]], -1)
         return replace(
             batch,
             observations=self._seen(batch.observations, elements),
-            actions=_mapped(self._actions, batch.actions, elements),
+            actions=torch.cat([_mapped(self._actions, action, elements), other], -1),
             next_observations=self._seen(batch.next_observations, elements),
         )
 

@@ -22,7 +22,7 @@ class Pool:
     """
 
     observations: torch.Tensor  # [R, D] float32
-    actions: torch.Tensor  # [R, A] float32, encoded; zero in absorbing rows
+    actions: torch.Tensor  # [R, A] float32, encoded; in absorbing rows the model's no_actions()
     next_observations: torch.Tensor  # [R, D] float32
     terminated: torch.Tensor  # [R] float32
     log_probs: torch.Tensor  # [R] float32, log pi(a|s); zero in absorbing rows
@@ -47,7 +47,7 @@ def make_pool(
         final = successors[ends]
         observations = torch.cat([observations, final])
         successors = torch.cat([successors, final])
-        actions = torch.cat([actions, torch.zeros(len(ends), model.action_size)])
+        actions = torch.cat([actions, model.no_actions(final)])
         log_probs = torch.cat([log_probs, torch.zeros(len(ends))])
         terminated = torch.zeros(len(observations))
         absorbed = len(data) + np.arange(len(ends))

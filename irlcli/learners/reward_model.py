@@ -32,6 +32,8 @@ class RewardModel(nn.Module):
             (``nn.Module.train``).
         choices: number of choices of each of K indices, in sum ``action_size``; empty if there is
             one.
+        shared_absorbing: all absorbing states look alike to g, which knows them by an input of their
+            own (Kostrikov et al. 2019). Otherwise each keeps its final observation.
 
     Raises:
         ValueError: an observation has no such column, or other choices.
@@ -50,6 +52,7 @@ class RewardModel(nn.Module):
         columns: Sequence[int] = (),
         dropout: float = 0.0,
         choices: Sequence[int] = (),
+        shared_absorbing: bool = False,
     ):
         super().__init__()
         self.observation_size = observation_size
@@ -66,18 +69,35 @@ class RewardModel(nn.Module):
             raise ValueError(
                 f"columns {self.columns} are not all entries of an observation of {observation_size}"
             )
+        self.shared_absorbing = shared_absorbing
         seen = len(columns) or observation_size
-        self.g = mlp(seen if state_only else seen + action_size, hidden, activation, dropout)
+        inputs = seen + (0 if state_only else action_size) + int(shared_absorbing)
+        self.g = mlp(inputs, hidden, activation, dropout)
         self.h = mlp(seen, hidden, activation, dropout) if shaping else None
 
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
-        """Actions as vectors [B, A]: one-hot if discrete, those of several indices side by side."""
-        if not self.discrete:
-            return actions
-        indices = actions.unbind(-1) if self.choices else (actions,)
-        parts = zip(indices, self.choices or (self.action_size,), strict=True)
-        # one_hot() of any batch size cannot be exported: it looks at the largest index.
-        return torch.cat([part[..., None] == torch.arange(n) for part, n in parts], -1).float()
+        """Actions as vectors [B, A]: one-hot if discrete, those of several indices side by side.
+
+        With ``shared_absorbing`` a zero follows [B, A + 1]: the states are not absorbing.
+        """
+        vectors = actions
+        if self.discrete:
+            indices = actions.unbind(-1) if self.choices else (actions,)
+            parts = zip(indices, self.choices or (self.action_size,), strict=True)
+            # one_hot() of any batch size cannot be exported: it looks at the largest index.
+            vectors = torch.cat(
+                [part[..., None] == torch.arange(n) for part, n in parts], -1
+            ).float()
+        if self.shared_absorbing:
+            vectors = torch.cat([vectors, torch.zeros_like(vectors[..., :1])], -1)
+        return vectors
+
+    def no_actions(self, observations: torch.Tensor) -> torch.Tensor:
+        """The action vectors of absorbing states that keep ``observations`` [B, D]."""
+        none = observations.new_zeros(*observations.shape[:-1], self.action_size)
+        if self.shared_absorbing:
+            none = torch.cat([none, torch.ones_like(none[..., :1])], -1)
+        return none
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """g [B] for observations [B, D] and encoded actions [B, A]."""
@@ -86,10 +106,16 @@ class RewardModel(nn.Module):
     def inputs(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
         """What the network g sees [B, D] or [B, D + A]: normalised observations, actions.
 
-        With columns, D is their number.
+        With columns, D is their number. With ``shared_absorbing`` one more input is 1 in absorbing
+        states, where all others are 0.
         """
         s = self._seen(observations)
-        return s if self.state_only else torch.cat([s, action_vectors], -1)
+        if not self.shared_absorbing:
+            return s if self.state_only else torch.cat([s, action_vectors], -1)
+        absorbing = action_vectors[..., -1:]
+        return torch.cat(
+            [s * (1.0 - absorbing), absorbing if self.state_only else action_vectors], -1
+        )
 
     def _seen(self, observations: torch.Tensor) -> torch.Tensor:
         normalised = self.normaliser(observations)
@@ -113,7 +139,7 @@ class RewardModel(nn.Module):
     def absorbing_reward(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(g, f) [B] of the absorbing states in which episodes ended with ``observations`` [B, D].
 
-        An absorbing state offers no choice: its action vector is zero and log pi is zero, so
+        An absorbing state offers no choice: its action is zero and log pi is zero, so
         f = g + (gamma - 1) h.
         """
         g = absorbed(self, observations)
@@ -143,6 +169,10 @@ class AveragedReward(nn.Module):
         self.discrete = members[0].discrete
         self.choices = members[0].choices
 
+    def no_actions(self, observations: torch.Tensor) -> torch.Tensor:
+        """As :meth:`RewardModel.no_actions`."""
+        return self._models[0].no_actions(observations)
+
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
         """As :meth:`RewardModel.encode`."""
         return self._models[0].encode(actions)
@@ -162,9 +192,8 @@ RewardModule = RewardModel | AveragedReward
 
 
 def absorbed(model: RewardModule, observations: torch.Tensor) -> torch.Tensor:
-    """g [B] of the absorbing states that keep ``observations`` [B, D]: their action vector is zero."""
-    none = observations.new_zeros(*observations.shape[:-1], model.action_size)
-    return model.reward(observations, none)
+    """g [B] of the absorbing states in which episodes ended with ``observations`` [B, D]."""
+    return model.reward(observations, model.no_actions(observations))
 
 
 def build(members: int = 1, **shape: Any) -> RewardModule:
