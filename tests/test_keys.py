@@ -241,7 +241,7 @@ UNREAD_AIRL = [
 # What a stage does not read, whatever the other fields are.
 UNREAD = {
     # The bar is for the report of the experts; no episode of this environment terminates.
-    "": ["expert.bar", "airl.fixed_horizon"],
+    "": ["expert.bar", "airl.fixed_horizon", "airl.shared_absorbing"],
     "train-airl": UNREAD_AIRL,
     "transfer": UNREAD_AIRL,
     "transfer by SAC": UNREAD_AIRL,
@@ -287,6 +287,7 @@ CHANGED = {
     "airl.averaged_by": "learning-rate",
     "airl.plateau_rounds": 3,
     "airl.symmetries": True,
+    "airl.shared_absorbing": True,
     "airl.challenger.per_setting": True,
     "transfer.algorithm": "other",
     "transfer.ceiling": 0.9,
@@ -557,6 +558,24 @@ def test_no_symmetries_are_in_no_key():
 
     none, some = (with_field(in_use(), "airl.symmetries", value) for value in (False, True))
     assert of_the_ant(none) == of_the_ant(in_use()) != of_the_ant(some)
+
+
+def test_absorbing_states_of_their_own_are_in_no_key():
+    settings = parse_settings("mujoco-hopper", "mass=0.75x,1.25x")
+
+    def of_the_hopper(**changed):
+        fields = {"airl.select": "last", "airl.shaping": False, **changed}
+        config = in_use()
+        for name, value in fields.items():
+            config = with_field(config, name, value)
+        return key(train_airl.request(From(demos(config)), "mujoco-hopper", settings, config.airl))
+
+    with pytest.raises(UsageError, match=r"shared_absorbing needs airl\.shaping = false"):
+        of_the_hopper(**{"airl.shared_absorbing": True, "airl.shaping": True})
+    none, shared = (of_the_hopper(**{"airl.shared_absorbing": v}) for v in (False, True))
+    assert none == of_the_hopper() != shared
+    free = {"airl.fixed_horizon": False}
+    assert of_the_hopper(**free) == of_the_hopper(**free, **{"airl.shared_absorbing": True})
 
 
 def test_the_last_round_alone_is_in_no_key():
