@@ -4,8 +4,11 @@ import json
 import sys
 
 import pytest
+import torch
 
+from irlcli.data.tensors import load_reward_file
 from irlcli.envs.mujoco.spec import MUJOCO_ROBOTS
+from irlcli.learners.reward_model import absorbed
 from irlcli.store import Store
 
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install '.[mujoco]'")
@@ -41,6 +44,26 @@ def test_the_chain_runs_and_reports_progress(chain, irl):
     assert "mujoco-hopper mass=1.5x" in done.out
     library = Store(chain).resolve("score").artefact.provenance()["libraries"]["mujoco"]
     assert library is not None
+
+
+def test_a_reward_may_share_one_absorbing_state(chain, irl):
+    common = ["--store", chain, "--profile", "smoke", "--quiet"]
+    shared = ["--set", "airl.shared_absorbing=true"]
+    train = ["train-airl", "--demos", "demos", "--method", "irm", *SMALL, *common, *shared]
+    done = irl(*train, "--name", "shared")
+    assert done.code == 0, done.err
+    done = irl(
+        "transfer", "--reward", "shared", "--ood", "mass", *SMALL, *common, "--name", "on-shared"
+    )
+    assert done.code == 0, done.err
+    assert "with a shared absorbing state" in irl("lineage", "on-shared", "--store", chain).out
+    model, description = load_reward_file(
+        Store(chain).resolve("shared").artefact.directory / "reward.pt"
+    )
+    finals = torch.randn(10, description.network.observation_size)
+    assert len(absorbed(model, finals).unique()) == 1
+    done = irl(*train, "--set", "airl.shaping=true")
+    assert done.code == 2 and "airl.shared_absorbing needs airl.shaping = false" in done.err
 
 
 def random_returns(irl, store, env: str, setting: str) -> dict:
