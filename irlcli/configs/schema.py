@@ -116,7 +116,7 @@ class SACConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         n_envs: worlds stepped together.
         n_steps: steps of each world in a round. Every round starts new episodes.
         train_freq: steps of each world between two updates, of ``gradient_steps`` minibatches each.
-        learning_starts: steps, in sum over the worlds, of uniformly random actions.
+        learning_starts: uniformly random steps, counted over all worlds.
         buffer_size: transitions kept for replay.
         tau: weight of the new parameters in the target network.
         ent_coef: temperature of the entropy bonus; None: learned.
@@ -321,11 +321,6 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     select_episodes: Count = 10
     challenger: ChallengerConfig = ChallengerConfig()
 
-    @property
-    def selecting_setting(self) -> str | None:
-        """The setting in which the round that is kept earns most, if one selects."""
-        return None if self.select in ("last", "episodes") else self.select
-
     ppo: PPOConfig = PPOConfig()
     dropout: Dropout | UnsetType = UNSET
     columns: Columns | UnsetType = UNSET
@@ -334,6 +329,11 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     plateau_rounds: Count | UnsetType = UNSET
     symmetries: bool | UnsetType = UNSET
     shared_absorbing: bool | UnsetType = UNSET
+
+    @property
+    def selecting_setting(self) -> str | None:
+        """The setting in which the round that is kept earns most, if one selects."""
+        return None if self.select in ("last", "episodes") else self.select
 
 
 class InterventionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -34,9 +34,17 @@ _LIBRARIES = (
     "matplotlib",
 )
 
-
 # Not everyone has them. What was made without one of them does not depend on it.
 _OPTIONAL = ("mujoco",)
+
+# Options with a reference; that of `--expert` stands behind its setting. `irl assess` takes it bare.
+_REFERRING = ("--demos", "--reward", "--policy", "--expert")
+
+_OF_A_REPOSITORY = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
+
+
+class _Schema(msgspec.Struct):
+    schema: int
 
 
 class Attempt(msgspec.Struct, frozen=True, kw_only=True):
@@ -107,17 +115,6 @@ def other_versions(origin: Mapping[str, Any]) -> list[str]:
     """
     recorded = origin.get("libraries") or {}
     return differing({**recorded, "irlcli": libraries()["irlcli"]})
-
-
-# Options with a reference; that of `--expert` stands behind its setting. `irl assess` takes it bare.
-_REFERRING = ("--demos", "--reward", "--policy", "--expert")
-
-
-_OF_A_REPOSITORY = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
-
-
-class _Schema(msgspec.Struct):
-    schema: int
 
 
 class Clock:

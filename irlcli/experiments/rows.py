@@ -193,6 +193,11 @@ class _Reward(NamedTuple):
     measures: Sequence[str]
 
     @property
+    def curves(self) -> dict[str, Request]:
+        """What a cell shows of the reward learning; cloning has no curve."""
+        return {"reward-learning": self.learned} if self.learned.stage.name == "train-airl" else {}
+
+    @property
     def label(self) -> str:
         return train_airl.reward_label(self.learned.parameters.airl, self.run.seed)
 
@@ -276,7 +281,7 @@ def _run(
     if not method(run.method).learns_reward:
         cloned = clone.request(From(demos), env, trained, requests.config, run.seed)
         yield Task(run.name, "rewards", cloned)
-        yield from _imitation(_Reward(requests, demos, cloned, run, measures), {})
+        yield from _imitation(_Reward(requests, demos, cloned, run, measures))
         return
     airl = run.config_of(env, run.method).airl_of(trained)
     basis = {}
@@ -298,7 +303,7 @@ def _run(
     learned = train_airl.request(From(demos), env, trained, airl, run.seed, basis)
     yield Task(run.name, "rewards", learned)
     reward = _Reward(requests, demos, learned, run, measures)
-    yield from _imitation(reward, {"reward-learning": learned})
+    yield from _imitation(reward)
     retrained: dict[str, list[Member]] = {}
     for measure in (measure for measure in RETRAINED if measure in measures):
         for retraining in range(retrainings):
@@ -318,12 +323,12 @@ def _run(
         request = measure_cue.request(
             From(learned, "reward.pt"), From(demos), env, trained, reward.label
         )
-        yield Task(f"{run.name}.cue", "returns", request, reward.cell(CUE))
+        yield Task(f"{run.name}.cue", "returns", request, reward.cell(CUE), reward.curves)
     if ASSESS in measures:
         yield from _assessment(reward, retrained)
 
 
-def _imitation(reward: _Reward, curves: Mapping[str, Request]) -> Iterator[Task]:
+def _imitation(reward: _Reward) -> Iterator[Task]:
     """What the policy earns that was trained on the demonstrations: a student, or a clone."""
     requests, run = reward.requests, reward.run
     label = f"{reward.learned.stage.name} {run.agent} of seed {run.seed}"
@@ -331,7 +336,7 @@ def _imitation(reward: _Reward, curves: Mapping[str, Request]) -> Iterator[Task]
         if measure in reward.measures:
             request = requests.returns(settings, reward.learned, policy_label=label)
             name = f"{run.name}.{measure}-returns"
-            yield Task(name, "returns", request, reward.cell(measure), curves)
+            yield Task(name, "returns", request, reward.cell(measure), reward.curves)
 
 
 def _expert_by_reward(reward: _Reward) -> Task:
@@ -377,7 +382,7 @@ def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Member]]) -> I
         policy = re.sub(r"[ ,:]+", "-", policy)
         yield Task(f"{owner}.bank.{policy}.{_value(entry.setting)}", "returns", recorded)
     request = assess.request(From(reward.learned, "reward.pt"), row.env, members, reward.label)
-    yield Task(f"{run.name}.assess", "returns", request, reward.cell(ASSESS))
+    yield Task(f"{run.name}.assess", "returns", request, reward.cell(ASSESS), reward.curves)
 
 
 def _known_as(measure: str, retraining: int) -> str:
@@ -424,8 +429,8 @@ def _retrained(
         ceiling=config.ceiling if measure == "transfer" else None,
     )
     first = measure == "transfer" and not retraining
-    curves = {"transfer-learning": moved} if first else {}
-    yield Task(f"{name}-returns", "returns", request, cell, curves)
+    own = {"transfer-learning": moved} if first else {}
+    yield Task(f"{name}-returns", "returns", request, cell, reward.curves | own)
 
 
 def _choice(name: str, choice: Request) -> Iterator[Task]:

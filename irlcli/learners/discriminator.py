@@ -80,7 +80,7 @@ def discriminator_loss(
     Args:
         logits: of the student's and the experts' samples [E, 2, B].
         f: the learned part [E, 2, B].
-        weights: w [E], in sum one.
+        weights: w [E], summing to one.
         config: s (``challenger.share``), c (``gradient_penalty``), the penalty and its estimate.
             With the grouping ``balanced`` the penalty sees all E as one risk.
         penalty_weight: lambda of this round.
@@ -146,7 +146,7 @@ def minibatch_loss(
     Args:
         batch: the student's and the experts' samples [E, 2, B].
         challenger: a challenger's and the experts'; None: there is none.
-        weights: w [E], in sum one.
+        weights: w [E], summing to one.
         penalty_weight: lambda of this round.
         generator: draws the points of the gradient penalty.
     """

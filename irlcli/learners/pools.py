@@ -22,7 +22,7 @@ class Pool:
     """
 
     observations: torch.Tensor  # [R, D] float32
-    actions: torch.Tensor  # [R, A] float32, encoded; in absorbing rows the model's no_actions()
+    actions: torch.Tensor  # [R, A] float32, encoded, or the model's no_actions() in absorbing rows
     next_observations: torch.Tensor  # [R, D] float32
     terminated: torch.Tensor  # [R] float32
     log_probs: torch.Tensor  # [R] float32, log pi(a|s); zero in absorbing rows

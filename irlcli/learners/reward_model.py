@@ -30,7 +30,7 @@ class RewardModel(nn.Module):
         columns: the entries of an observation that g and h see; all if there are none.
         dropout: probability that a hidden unit is left out in training mode
             (``nn.Module.train``).
-        choices: number of choices of each of K indices, in sum ``action_size``; empty if there is
+        choices: number of choices of each of K indices, summing to ``action_size``; empty if there is
             one.
         shared_absorbing: all absorbing states look alike to g, which knows them by an input of their
             own (Kostrikov et al. 2019). Otherwise each keeps its final observation.
@@ -100,7 +100,7 @@ class RewardModel(nn.Module):
         return none
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
-        """g [B] for observations [B, D] and encoded actions [B, A]."""
+        """g [B] for observations [B, D] and actions as :meth:`encode` gives them."""
         return self.g(self.inputs(observations, action_vectors))[..., 0]
 
     def inputs(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
@@ -178,7 +178,7 @@ class AveragedReward(nn.Module):
         return self._models[0].encode(actions)
 
     def reward(self, observations: torch.Tensor, action_vectors: torch.Tensor) -> torch.Tensor:
-        """The mean of g [B] for observations [B, D] and encoded actions [B, A]."""
+        """The mean of g [B] for observations [B, D] and actions as :meth:`encode` gives them."""
         found = [member.reward(observations, action_vectors) for member in self._models]
         return torch.stack(found).mean(0)
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
-from irlcli.methods import METHODS
 from irlcli.report.agents import IN_DISTRIBUTION, title
 from irlcli.report.compute import IMITATED, Assessments, failed_to_imitate
 from irlcli.report.lineage import is_mixed, lineage, origins, short
@@ -94,7 +93,7 @@ def weak_experts(
     ]
     for row in p.rows if has_held_out(p.measures) else ():
         expert = means.get((row.name, "expert"))
-        others = _earned_in(row.unseen, points[points["row"] == row.name])
+        others = _earned_in(row.unseen, points[points["row"] == row.name], p.methods)
         if expert is not None and len(others) and others.max() > expert:
             found.append(
                 f"Weak expert: {row.name}: in {row.unseen} {others.idxmax()} earn {others.max():.1f}, "
@@ -103,11 +102,11 @@ def weak_experts(
     return found
 
 
-def _earned_in(setting: str, points: pd.DataFrame) -> pd.Series:
+def _earned_in(setting: str, points: pd.DataFrame, methods: Sequence[str]) -> pd.Series:
     """The mean true returns in ``setting`` of each method's policies, and of the best training expert."""
     of = points[(points["setting"] == setting) & points["true_return"].notna()]
     of = of[~of["measure"].isin([EXPERT_BY_REWARD, *IN_DISTRIBUTION])]
-    reused, learned = of[of["agent"] == "reused"], of[of["agent"].isin([*METHODS])]
+    reused, learned = of[of["agent"] == "reused"], of[of["agent"].isin(methods)]
     earned = {
         f"{title(agent)}'s {measure} policies": group["true_return"].mean()
         for (agent, measure), group in learned.groupby(["agent", "measure"], sort=False)

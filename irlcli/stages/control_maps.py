@@ -87,6 +87,14 @@ def _check(maps: CuedMapsConfig) -> None:
         raise UsageError(
             "control.maps.penalty_weights is empty", "for example [1.0, 100.0, 10000.0]"
         )
+    for field, listed in (("gaps", maps.gaps), ("settings", maps.settings)):
+        # A value that is given twice would count each seed twice.
+        if not listed or len({*listed}) < len(listed):
+            raise UsageError(
+                f"control.maps.{field} is {'empty' if not listed else 'not free of repeated values'}: "
+                f"{list(listed)}",
+                "give each value once",
+            )
     for field, counts in (
         ("strengths", [len(maps.strengths)]),
         ("settings", maps.settings),

@@ -136,7 +136,7 @@ def warn_of_failures(
 ) -> None:
     """Warn of demonstrations that end early and earn less than those of the setting that do not.
 
-    What follows such an end is then the expert's, too, and a reward may come to pay for it.
+    What follows such an end is then the expert's, too, and a reward may score it highly.
     ``deterministic``: whether they are the expert's most likely actions, or samples; None: unknown.
     """
     import numpy as np
@@ -155,7 +155,8 @@ def warn_of_failures(
         if early and others and np.mean(early) < np.mean(others):
             job.console.warn(
                 f"{len(early)} of {len(episodes)} demonstrations in {text} end early and earn less than "
-                "the others: a reward of absorbing states may pay for such ends" + other_kind
+                "the others: a reward may score absorbing states after such ends highly"
+                + other_kind
             )
 
 

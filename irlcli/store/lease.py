@@ -107,7 +107,7 @@ def leased(path: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
 
 @contextmanager
 def reading(directory: Path, gc: Path, locks_work: bool, patience: Patience) -> Iterator[None]:
-    """Keep the holder of the lease ``gc`` from starting, by a file of one's own in ``directory``.
+    """Keep the holder of the lease ``gc`` from starting, by this process's own file in ``directory``.
 
     Raises:
         Busy: a live process holds ``gc``, and ``patience`` is not to wait.

@@ -91,6 +91,9 @@ def test_the_report_rates_the_reward(irl, made, tables, tmp_path):
     assert "## Reward quality" in text and "(bank-lunar-lander-engine-power.png)" in text
     page = (tmp_path / "out" / "tiny.html").read_text()
     assert "Learned against true return" in page
+    # No student is evaluated in this table, but its reward has a discriminator.
+    assert "## The discriminator at the end of training" in text
+    assert "No learning curves exist yet" not in page
     assert ("Weak expert" in text) == (not verdicts) and ("1/1" in text or not verdicts)
 
 

@@ -16,7 +16,7 @@ from report_examples import (
 )
 
 from irlcli.report.build import build
-from irlcli.report.parameters import Others
+from irlcli.report.parameters import Others, Variant
 
 
 def test_a_complete_table_has_no_caveats():
@@ -57,6 +57,15 @@ def test_an_expert_below_another_policy_is_named(agent, measure, earned, better)
     found = build(*example(complete() | {(BOUNCE, agent, measure): earned}), {}, {}).caveats
     named = [c for c in found if c.startswith(f"Weak expert: {BOUNCE}: in bounce=0.9")]
     assert [better in c for c in named] == [True] * (better is not None)
+
+
+def test_an_expert_below_a_variants_policies_is_named():
+    returns = {(BOUNCE, "expert", "ood"): [250.0], (BOUNCE, "no ceiling", "transfer"): [999.0] * 3}
+    variants = (Variant("full"), Variant("no ceiling", ("transfer.ceiling=none",)))
+    names = tuple(v.name for v in variants)
+    p, points = example(returns, variants=variants, methods=names, learned_by="erm")
+    (named,) = (c for c in build(p, points, {}, {}).caveats if "own expert 250.0" in c)
+    assert "no ceiling's transfer policies earn 999.0" in named
 
 
 @pytest.mark.parametrize(("bar", "low"), [(None, False), (250.0, False), (251.0, True)])

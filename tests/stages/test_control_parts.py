@@ -86,6 +86,10 @@ def test_the_order_of_the_lambdas_does_not_matter():
         ("control.maps.warmup=500", "none of"),
         ("control.labels.warmup=500", "none of"),
         ("control.maps.penalty_weights=[]", "is empty"),
+        ("control.maps.gaps=[]", "control.maps.gaps is empty"),
+        ("control.maps.settings=[]", "control.maps.settings is empty"),
+        ("control.maps.gaps=[0.1,0.1]", r"control.maps.gaps.* repeated .*0.1, 0.1"),
+        ("control.maps.settings=[2,3,2]", r"control.maps.settings.* repeated .*2, 3, 2"),
     ],
 )
 def test_bad_input_is_one_line_that_says_what_is_allowed(irl, tmp_path, setting, named):
