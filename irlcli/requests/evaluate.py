@@ -1,7 +1,7 @@
 """``evaluate``: returns of policies, experts and baselines."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from irlcli import labels
 from irlcli.data.descriptions import Evaluation, Reward
@@ -14,6 +14,22 @@ from irlcli.requests.session import Session, StageSession
 from irlcli.stages import evaluate as stage
 from irlcli.stages.base import From, Request
 from irlcli.store import Artefact
+
+
+class _Asked(NamedTuple):
+    """Where and how often to measure, whoever acts.
+
+    Attributes:
+        scorer, scored: the reward that also scores the episodes, and the stage's arguments for it;
+            None and none without one.
+    """
+
+    where: arguments.Where
+    env: str | None
+    episodes: int | None
+    seed: int
+    scorer: Reward | None
+    scored: Mapping[str, Any]
 
 
 def evaluate(
@@ -58,12 +74,13 @@ def evaluate(
         arguments.check_env(reward, scorer.env, env)
         env = scorer.env
         scored = {"reward": source, "reward_label": reward_label(scorer.airl, scorer.seed)}
+    asked = _Asked(where, env, episodes, seed, scorer, scored)
     if policy is not None:
-        requests = [_of_policy(session, policy, where, env, episodes, seed, scorer, scored)]
+        requests = [_of_policy(session, policy, asked)]
     else:
         agent: Literal["expert", "random", "idle"]
         agent = "expert" if expert else "random" if random else "idle"
-        requests = _of_agent(session, agent, trained_in, where, env, episodes, seed, scorer, scored)
+        requests = _of_agent(session, agent, trained_in, asked)
     if name is not None and len(requests) > 1:
         raise UsageError(
             f"--name {name!r} cannot name {len(requests)} evaluations",
@@ -79,21 +96,13 @@ def measured(session: Session, artefact: Artefact) -> tuple[Evaluation, dict[str
     return references.summary(session.store, artefact), {}, own
 
 
-def _of_policy(
-    session: StageSession,
-    policy: str,
-    where: arguments.Where,
-    env: str | None,
-    episodes: int | None,
-    seed: int,
-    scorer: Reward | None,
-    scored: Mapping[str, Any],
-) -> Request:
+def _of_policy(session: StageSession, policy: str, asked: _Asked) -> Request:
+    where, scorer = asked.where, asked.scorer
     source, origin = references.tensor_file(session.store, policy, "policy")
     if scorer is not None:
         arguments.check_scorer(scorer.env, policy, origin.env)
-    arguments.check_env(policy, origin.env, env)
-    config = session.config(origin.env, {"evaluation.episodes": episodes})
+    arguments.check_env(policy, origin.env, asked.env)
+    config = session.config(origin.env, {"evaluation.episodes": asked.episodes})
     settings: Sequence[Setting]
     if where.given:
         settings = where.settings(origin.env, config, origin)
@@ -115,9 +124,9 @@ def _of_policy(
         settings,
         config.evaluation,
         source,
-        seed=seed,
+        seed=asked.seed,
         policy_label=label,
-        **scored,
+        **asked.scored,
     )
 
 
@@ -125,13 +134,9 @@ def _of_agent(
     session: StageSession,
     agent: Literal["expert", "random", "idle"],
     trained_in: str | None,
-    where: arguments.Where,
-    env: str | None,
-    episodes: int | None,
-    seed: int,
-    scorer: Reward | None,
-    scored: Mapping[str, Any],
+    asked: _Asked,
 ) -> list[Request]:
+    env, where, seed, scored = asked.env, asked.where, asked.seed, asked.scored
     if env is None or not where.given:
         missing = [] if env is not None else ["--env ENV"]
         missing += (
@@ -143,8 +148,8 @@ def _of_agent(
             f"--{agent} needs an environment and the settings to evaluate in",
             f"add {' and '.join(missing)}",
         )
-    config = session.config(env, {"evaluation.episodes": episodes})
-    settings = where.settings(env, config, scorer)
+    config = session.config(env, {"evaluation.episodes": asked.episodes})
+    settings = where.settings(env, config, asked.scorer)
     if agent != "expert":
         return [stage.request(env, settings, config.evaluation, agent=agent, seed=seed, **scored)]
     from irlcli.stages import train_expert
