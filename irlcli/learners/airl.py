@@ -13,11 +13,12 @@ Tensors in, tensors out: files, logging and the RL library stay outside. Samples
 [E, 2, B]: E risks, label 0 = policy and 1 = expert, B samples of each.
 
 Absorbing states. Where episodes may end early, the sign of a learned reward alone can solve the
-task (Kostrikov et al. 2019). Here an ended episode stays in an absorbing state, which keeps its final
-observation or, with ``shared_absorbing``, is the same for all. The time limit is bootstrapped through, so the state is worth the geometric series
-f / (1 - gamma), added in closed form. The discriminator sees the state as often as stepping on to
-the horizon would show it, if a round is at least as long as the horizon. In shorter rounds it sees
-the state too often. Only episodes that begin at least one horizon before the round's end are used
+task (Kostrikov et al. 2019). Here an ended episode stays in an absorbing state, which keeps its
+final observation or, with ``shared_absorbing``, is the same for all. The time limit is bootstrapped
+through, so the state is worth the geometric series f / (1 - gamma), added in closed form. The
+discriminator sees the state as often as stepping on to the horizon would show it, if a round is at
+least as long as the horizon. In shorter rounds it sees the state too often. Only episodes that
+begin at least one horizon before the round's end are used
 (:func:`irlcli.learners.replay.whole_episodes`).
 """
 

@@ -90,10 +90,9 @@ def _check(maps: CuedMapsConfig) -> None:
     for field, listed in (("gaps", maps.gaps), ("settings", maps.settings)):
         # A value that is given twice would count each seed twice.
         if not listed or len({*listed}) < len(listed):
+            problem = "has repeated values" if listed else "is empty"
             raise UsageError(
-                f"control.maps.{field} is {'empty' if not listed else 'not free of repeated values'}: "
-                f"{list(listed)}",
-                "give each value once",
+                f"control.maps.{field} {problem}: {list(listed)}", "give each value once"
             )
     for field, counts in (
         ("strengths", [len(maps.strengths)]),
