@@ -1,5 +1,6 @@
 """``irl push`` and ``irl pull``: artefacts from one store to another."""
 
+import os
 import shlex
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,7 @@ from irlcli.errors import (
 from irlcli.store import Artefact
 
 if TYPE_CHECKING:
+    from irlcli.store.share import Shared
     from irlcli.store.sources import Place
     from irlcli.store.substitute import Advance
 
@@ -119,9 +121,70 @@ def _share(
     everything: bool,
     unread: list[str],
 ) -> None:
-    from irlcli.store.share import share
-
+    """Copy ``artefacts`` and print what was copied; ``unread`` are ids of those that cannot be."""
+    if os.path.realpath(source.root) == os.path.realpath(target.root):
+        raise UsageError(f"{label}: that is this store itself", "name another one")
     console = out.TerminalConsole(quiet)
+    try:
+        shared = _copied(source, target, artefacts, label, console, everything)
+    finally:
+        console.close()
+    for name, holder in shared.taken.items():
+        console.warn(
+            f"{target.root} already uses the name {name!r} for {holder}, so {name!r} was not copied"
+        )
+    for id16, holder in shared.diverged.items():
+        console.warn(
+            f"{id16} is kept beside {holder}: the same request gave {holder} in {target.root}, and "
+            "commands find that one"
+        )
+    console.say(
+        f"{out.counted(len(shared.copied), 'artefact')}, {shared.bytes:,} bytes copied to {target.root}; "
+        f"{len(shared.present)} there already"
+    )
+    there = {artefact.id for artefact in (*shared.copied, *shared.present)}
+    paths = {a.id: f"{target.root}/{a.id}" for a in artefacts if a.id in there}
+    left_out = [*unread, *(artefact.id for artefact in artefacts if artefact.id not in there)]
+    document: dict[str, Any] = {
+        "artefacts": [{"id": id16, "path": path} for id16, path in paths.items()],
+        "copied": [a.id for a in shared.copied],
+        "present": [a.id for a in shared.present],
+        "bytes": shared.bytes,
+        "names": shared.names,
+        "names_kept": shared.taken,
+        "diverged": shared.diverged,
+        "left_out": left_out,
+    }
+    if not session.as_json:
+        for path in paths.values():
+            out.print_data(path)
+    if left_out:
+        raise IntegrityError(
+            f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, because of "
+            f"damaged files: {', '.join(left_out)}",
+            f"remove the damaged ones, which the warnings name, in {source.root}; then compute or push "
+            "them again",
+            document,
+        )
+    if session.as_json:
+        out.print_json("shared", document)
+
+
+def _copied(
+    source: "Place",
+    target: "Place",
+    artefacts: list[Artefact],
+    label: str,
+    console: out.TerminalConsole,
+    everything: bool,
+) -> "Shared":
+    """Copy ``artefacts``, with progress.
+
+    Raises:
+        StageFailed: a file cannot be read or written.
+        IntegrityError: an artefact is damaged.
+    """
+    from irlcli.store.share import share
 
     def start(count: int, total: int) -> "Advance":
         done = 0
@@ -136,7 +199,7 @@ def _share(
         return advance
 
     try:
-        shared = share(source, target, artefacts, console.warn, start, partial=everything)
+        return share(source, target, artefacts, console.warn, start, partial=everything)
     except OSError as error:
         raise StageFailed(
             f"{label}: {file_failure(error).message}",
@@ -147,48 +210,6 @@ def _share(
         if error.message.startswith(f"{source.root}/") and not isinstance(error, NewerFormat):
             error.hint = _damaged_there(source)
         raise
-    finally:
-        console.close()
-    for name, holder in shared.taken.items():
-        console.warn(
-            f"{target.root} already uses the name {name!r} for {holder}, so {name!r} was not copied"
-        )
-    for id16, holder in shared.diverged.items():
-        console.warn(
-            f"{id16} is kept beside {holder}: the same request gave {holder} in {target.root}, and "
-            "commands find that one"
-        )
-    there = {artefact.id for artefact in (*shared.copied, *shared.present)}
-    left_out = [*unread, *(artefact.id for artefact in artefacts if artefact.id not in there)]
-    artefacts = [artefact for artefact in artefacts if artefact.id in there]
-    where = f"{target.root}/"
-    console.say(
-        f"{out.counted(len(shared.copied), 'artefact')}, {shared.bytes:,} bytes copied to {target.root}; "
-        f"{len(shared.present)} there already"
-    )
-    document: dict[str, Any] = {
-        "artefacts": [{"id": a.id, "path": where + a.id} for a in artefacts],
-        "copied": [a.id for a in shared.copied],
-        "present": [a.id for a in shared.present],
-        "bytes": shared.bytes,
-        "names": shared.names,
-        "names_kept": shared.taken,
-        "diverged": shared.diverged,
-        "left_out": left_out,
-    }
-    if not session.as_json:
-        for artefact in artefacts:
-            out.print_data(where + artefact.id)
-    if left_out:
-        raise IntegrityError(
-            f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, because of "
-            f"damaged files: {', '.join(left_out)}",
-            f"remove the damaged ones, which the warnings name, in {source.root}; then compute or push "
-            "them again",
-            document,
-        )
-    if session.as_json:
-        out.print_json("shared", document)
 
 
 def _damaged_there(place: "Place") -> str:

@@ -132,21 +132,7 @@ def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] 
     until = PHASES[-1] if choice.until is None else choice.until
     if until not in PHASES:
         raise UsageError(f"unknown --until {until!r}", suggest(until, PHASES))
-    candidates: Sequence[float] | Literal["own"] = ()
-    if choice.choose_penalty is not None:
-        if table.kind != "comparison" or table.variants:
-            hint = f"set airl.penalty_weight in [{table.name}.variants]" if table.variants else ""
-            raise UsageError(
-                f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty"
-            )
-        if all(METHODS[name].penalty == "none" for name in table.methods):
-            weighed = ", ".join(name for name, m in METHODS.items() if m.penalty != "none")
-            raise UsageError(
-                f"--choose-penalty: no method of {', '.join(table.methods)} has a penalty to weigh",
-                f"add one to --methods: {weighed}",
-            )
-        arguments.check_chosen(session.overrides)
-        candidates = arguments.weights(choice.choose_penalty)
+    candidates = _candidates(session, choice, table)
     tag = _tag(table, session.profile) if choice.tag is None else choice.tag
     try:
         session.store.check_name(f"{tag}.{table.name}")
@@ -168,6 +154,29 @@ def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] 
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
+
+
+def _candidates(
+    session: StageSession, choice: TableChoice, table: "Table"
+) -> Sequence[float] | Literal["own"]:
+    """The values of lambda that ``--choose-penalty`` lists for ``table``; none without the option.
+
+    Raises:
+        UsageError: the table has no lambda to choose, or a value is bad.
+    """
+    if choice.choose_penalty is None:
+        return ()
+    if table.kind != "comparison" or table.variants:
+        hint = f"set airl.penalty_weight in [{table.name}.variants]" if table.variants else ""
+        raise UsageError(f"{table.name} takes no --choose-penalty", hint or "omit --choose-penalty")
+    if all(METHODS[name].penalty == "none" for name in table.methods):
+        weighed = ", ".join(name for name, m in METHODS.items() if m.penalty != "none")
+        raise UsageError(
+            f"--choose-penalty: no method of {', '.join(table.methods)} has a penalty to weigh",
+            f"add one to --methods: {weighed}",
+        )
+    arguments.check_chosen(session.overrides)
+    return arguments.weights(choice.choose_penalty)
 
 
 def _tag(table: "Table", profile: str) -> str:

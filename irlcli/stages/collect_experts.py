@@ -170,6 +170,7 @@ def _episodes(job: Job, text: str, wanted: int) -> list[Trajectory]:
         if not p.full_length:
             return episodes
         found += [t for t in episodes if len(t) == p.environment.max_episode_steps]
+        job.console.progress(min(len(found), wanted), wanted, "episodes", {text: "of full length"})
         if len(found) >= wanted:
             return found[:wanted]
     raise StageFailed(

@@ -104,8 +104,8 @@ def check(layout: Layout) -> None:
     """Check that the root is a store of a known format, an empty directory, or absent.
 
     Raises:
-        IntegrityError: the root holds other files, a newer store, or links in place of directories.
-        UsageError: the root is not a directory.
+        IntegrityError: the root is a newer store, or has links in place of directories.
+        UsageError: the root is not a directory, or holds other files.
     """
     root, marker = layout.root, layout.marker
     hint = "name a directory: an artefact store, or one that is empty or not there yet"
@@ -136,7 +136,7 @@ def check(layout: Layout) -> None:
         if marker.exists():
             # Another process created the store meanwhile.
             return check(layout)
-        raise IntegrityError(
+        raise UsageError(
             f"{root} contains files but is not a store",
             "name a store" if layout.read_only else "name a store, or an empty or new directory",
         )

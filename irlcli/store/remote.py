@@ -213,15 +213,14 @@ class Remote:
         """Write the format marker if it is missing.
 
         Raises:
-            UsageError: a URL that can only be read.
-            IntegrityError: there are other files at the URL.
+            UsageError: a URL that can only be read, or other files at the URL.
         """
         if self.root.startswith(("http://", "https://")):
             raise UsageError(f"{self.root} can only be read", "push to a directory or a bucket")
         if self.exists():
             return
         if self._list(""):
-            raise IntegrityError(
+            raise UsageError(
                 f"{self.root} contains files but is not a store",
                 "name a store, or an empty or new place",
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -29,7 +30,8 @@ def open_place(place: Path | str, warn: Callable[[str], None], read_only: bool =
 
     Raises:
         IntegrityError: a newer store, or a damaged one.
-        UsageError: an empty text, a path that is no directory, or a URL that cannot be used.
+        UsageError: an empty text, a path that is no directory, a directory of other files, or a URL
+            that cannot be used.
         StageFailed: a URL cannot be reached.
     """
     text = str(place)
@@ -43,6 +45,11 @@ def open_place(place: Path | str, warn: Callable[[str], None], read_only: bool =
         from irlcli.store.remote import Remote
 
         return Remote(text, warn)
+    elif mistyped := re.match(r"([a-z][a-z0-9+]+):/", text):
+        raise UsageError(
+            f"{text} has one slash after {mistyped[1]}:",
+            f"a URL has two: {mistyped[1]}://; a directory of this name is ./{text}",
+        )
     return Store(text, warn, read_only)
 
 

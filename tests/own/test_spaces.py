@@ -531,6 +531,8 @@ def test_an_expert_whose_episodes_all_end_early_has_none_of_full_length(irl, tmp
     line += ["--profile", "smoke", "--set", "demonstrations.full_length=true"]
     done = irl(*line, "--store", tmp_path / "runs")
     assert done.code == 1 and "0 of 40 episodes" in done.err and "full_length" in done.err, done.err
+    # Progress says that the first of the forty found none, too.
+    assert "0/2 episodes  bounce=0.1 of full length" in done.err
 
 
 def test_actions_in_other_units_and_a_time_limit_written_as_an_end_are_warned_of(bench):

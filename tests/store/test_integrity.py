@@ -21,7 +21,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from irlcli.errors import IntegrityError, NotFound
+from irlcli.errors import IntegrityError, NotFound, UsageError
 from irlcli.store import Artefact, KeyRecord, Manifest, Output, Store
 from irlcli.store.digest import digest
 from irlcli.store.manifest import check_output_path, read_manifest, read_provenance
@@ -639,6 +639,6 @@ def test_newer_store_is_refused(empty_store):
 def test_a_directory_with_other_files_is_refused(tmp_path, name):
     """Only the files that an interrupted create() leaves are accepted."""
     (tmp_path / name).mkdir()
-    with pytest.raises(IntegrityError, match="not a store"):
+    with pytest.raises(UsageError, match="not a store"):
         Store(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [name]

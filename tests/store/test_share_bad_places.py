@@ -203,6 +203,7 @@ def test_only_outputs_are_taken(store, chain, url, tmp_path):
         ("nope://bucket/x", 2, "'nope' is unknown"),
         ("memory://nothing-here", 3, "is not a store"),
         ("zoo-of-nobody", 3, "is not a store"),
+        ("s3:/bucket/x", 2, "one slash"),
     ],
 )
 def test_a_place_that_is_no_store(irl, tmp_path, place, code, words):
@@ -230,10 +231,19 @@ def test_a_bucket_that_cannot_be_used(irl, store, chain, bucket, monkeypatch):
     assert code == 2 and "no credentials" in error
 
 
+@pytest.mark.parametrize("option", ["push --to", "pull --from"])
+def test_a_store_is_not_copied_to_itself(irl, store, chain, option):
+    command, place = option.split()
+    # The same directory by another path.
+    itself = store.root.parent / "." / store.root.name / ".." / store.root.name
+    result = irl(command, "irm-0", place, itself, "--store", store.root)
+    assert result.code == 2 and "itself" in result.err and not result.out
+
+
 def test_files_that_are_no_store_are_left_alone(irl, store, chain, url):
     memory().pipe_file(f"/{url.removeprefix('memory://')}/thesis.tex", b"x")
     result = irl("push", "irm-0", "--to", url, "--store", store.root)
-    assert result.code == 4 and "not a store" in result.err
+    assert result.code == 2 and "not a store" in result.err
     assert result.err.endswith("hint: name a store, or an empty or new place\n")
     assert memory().ls(f"/{url.removeprefix('memory://')}", detail=False)[1:] == []
 
