@@ -160,6 +160,17 @@ def warn_of_failures(
             )
 
 
+def warn_of_shared_ends(job: Job, settings: Mapping[str, "Sequence[Trajectory]"]) -> None:
+    """Warn if demonstrations end early although all absorbing states are one (``shared_absorbing``)."""
+    for text, episodes in settings.items():
+        if early := sum(t.terminated for t in episodes):
+            job.console.warn(
+                f"{early} of {len(episodes)} demonstrations in {text} end early: with "
+                "airl.shared_absorbing the reward cannot tell these ends, a landing for example, from a "
+                "fall; omit it, or leave them out with --set demonstrations.full_length=true"
+            )
+
+
 def shown(true_return: float, progress: float | None) -> str:
     """A true return for the user, with the environment's progress if it reports one."""
     if isnan(true_return):

@@ -19,7 +19,12 @@ from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
-from irlcli.stages.running import run_training, warn_of_failures, warn_of_labels
+from irlcli.stages.running import (
+    run_training,
+    warn_of_failures,
+    warn_of_labels,
+    warn_of_shared_ends,
+)
 
 if TYPE_CHECKING:
     from irlcli.learners.airl import AIRL
@@ -296,6 +301,8 @@ def _episodes(
     if p.airl.fixed_horizon:
         by_setting = dict(zip(settings, episodes, strict=True))
         warn_of_failures(job, by_setting, demos.metadata.get("deterministic"))
+        if p.airl.shared_absorbing:
+            warn_of_shared_ends(job, by_setting)
     if p.airl.grouping == "shuffled":
         warn_of_labels(job, [len(group) for group in episodes])
     return episodes, held_out

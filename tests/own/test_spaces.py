@@ -506,6 +506,29 @@ def test_demonstrations_that_fail_are_compared_with_the_other_kind(bench, sample
     assert f"--set demonstrations.deterministic={other}" in done.err
 
 
+def test_ends_that_look_like_falls_are_warned_of(bench):
+    """With a shared absorbing state, demonstrations that end early look like falls."""
+    bench.edit(bench.module, "reward = 1.0 - abs(self.position)", DERAILED)
+    bench.edit(bench.module, "abs(self.position) > 5.0", "derailed")
+    wanted = ("train-airl", "--method", "erm", "--profile", "smoke", "--demos", "demos")
+    shared = ("--set", "airl.shaping=false", "--set", "airl.shared_absorbing=true")
+    for whole, options, warned in (
+        ("false", (), False),
+        ("false", shared, True),
+        ("true", shared, False),
+    ):
+        done = bench.irl(
+            *(*COLLECT, *ONE, "--episodes", "8", "--name", "demos"),
+            *("--set", f"demonstrations.full_length={whole}"),
+        )
+        assert done.code == 0, done.err
+        done = bench.irl(*wanted, *options)
+        assert done.code == 0, done.err
+        assert (
+            "8 demonstrations in mass=2x end early: with airl.shared_absorbing" in done.err
+        ) == warned
+
+
 def test_only_demonstrations_of_full_length(bench):
     """Those that end early are left out, and others are recorded in their place."""
     bench.edit(bench.module, "reward = 1.0 - abs(self.position)", DERAILED)
