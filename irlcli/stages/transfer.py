@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from irlcli.learners.frozen import FrozenReward
+    from irlcli.rl.loop import Training
     from irlcli.rl.policy import Policy
+    from irlcli.rl.restarts import Restarts
+    from irlcli.rl.worlds import Worlds
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,50 +83,22 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_policy, write_rows
     from irlcli.data.tensors import load_reward_file
     from irlcli.envs.spaces import check_spaces
-    from irlcli.rl import algorithm
-    from irlcli.rl.loop import Training
     from irlcli.rl.policy import require_observations
     from irlcli.rl.restarts import Restarts
     from irlcli.rl.worlds import make_worlds
-    from irlcli.seeds import derive
 
     p: Parameters = job.parameters
-    env, config = p.environment.name, p.transfer.algorithm_config
-    settings = [parse_setting(env, p.setting)]
+    env, settings = p.environment.name, [parse_setting(p.environment.name, p.setting)]
     model, origin = load_reward_file(job.inputs["reward"])
     check_spaces(env, [*(parse_setting(env, text) for text in origin.settings), *settings])
-    student = None
-    if "start" in job.inputs:
-        student, config = _student(job.inputs["start"], config)
+    student, config = _student(job.inputs.get("start"), p.transfer.algorithm_config)
     reward = frozen_reward(
         p.environment, p.setting, model, origin, p.transfer.ceiling, config.gamma
     )
     with closing(make_worlds(env, settings, config.n_envs, job.workers)) as worlds:
         if student is not None:
             require_observations(student, worlds.observation_space, f"{env} {p.setting}")
-
-        def begin(restart: int) -> Training:
-            seed = derive(f"{STAGE.name} restart", p.seed, restart)[0] if restart else p.seed
-            # Other moments of the observations would turn the student into another policy.
-            kept = {} if student is None else {"keep_moments": True}
-            trainer = algorithm(p.transfer.algorithm)(
-                worlds, config, p.transfer.total_steps, seed, STAGE.name, **kept
-            )
-            if student is not None:
-                trainer.policy.load_state_dict(student.state_dict())
-            return Training(trainer, reward, [p.setting])
-
-        training: Training | Restarts
-        if p.transfer.restarts is UNSET:
-            training = begin(0)
-        else:
-            until = p.transfer.restart_steps
-            training = Restarts(
-                begin,
-                p.transfer.restarts,
-                partial(_learned_return, job, reward),
-                None if until is UNSET else until,
-            )
+        training = _training(job, worlds, config, reward, student)
         rows = run_training(job, training)
     write_policy(
         job.output,
@@ -144,6 +119,39 @@ def run(job: Job) -> None:
     write_rows(job.output / "metrics.parquet", rows)
 
 
+def _training(
+    job: Job, worlds: Worlds, config: Any, reward: FrozenReward, student: Policy | None
+) -> Training | Restarts:
+    """One training on ``reward``, or with ``transfer.restarts`` the best of several."""
+    from irlcli.rl import algorithm
+    from irlcli.rl.loop import Training
+    from irlcli.rl.restarts import Restarts
+    from irlcli.seeds import derive
+
+    p: Parameters = job.parameters
+
+    def begin(restart: int) -> Training:
+        seed = derive(f"{STAGE.name} restart", p.seed, restart)[0] if restart else p.seed
+        # Other moments of the observations would turn the student into another policy.
+        kept = {} if student is None else {"keep_moments": True}
+        trainer = algorithm(p.transfer.algorithm)(
+            worlds, config, p.transfer.total_steps, seed, STAGE.name, **kept
+        )
+        if student is not None:
+            trainer.policy.load_state_dict(student.state_dict())
+        return Training(trainer, reward, [p.setting])
+
+    if p.transfer.restarts is UNSET:
+        return begin(0)
+    until = p.transfer.restart_steps
+    return Restarts(
+        begin,
+        p.transfer.restarts,
+        partial(_learned_return, job, reward),
+        None if until is UNSET else until,
+    )
+
+
 def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:
     """Mean of ``policy`` over ``transfer.restart_episodes``, which are the same for every restart."""
     import numpy as np
@@ -161,12 +169,14 @@ def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:
     return float(np.mean([reward.of_episode(t) for t in found]))
 
 
-def _student(path: Path, config: Any) -> tuple[Policy, Any]:
-    """The policy to start from, and ``config`` with its network.
+def _student(path: Path | None, config: Any) -> tuple[Policy | None, Any]:
+    """The policy to start from, if any, and ``config`` with its network.
 
     Raises:
         UsageError: not a student.
     """
+    if path is None:
+        return None, config
     from irlcli.data.tensors import load_policy_file
 
     student, about = load_policy_file(path)
