@@ -49,9 +49,13 @@ def push(
 
     session.check_exists()
     place = open_place(to, session.console.warn)
-    artefacts, unread = _chosen(session.store, session.artefact, refs, everything)
+    source: Place = session.store
+    if everything:
+        # Otherwise the first damaged artefact would be moved to quarantine, and end the command.
+        source = open_place(source.root, session.console.warn, read_only=True)
+    artefacts, unread = _chosen(source, session.artefact, refs, everything)
     label = f"push to {place.root}"
-    _share(session, session.store, place, artefacts, label, quiet, everything, unread)
+    _share(session, source, place, artefacts, label, quiet, everything, unread)
 
 
 @store_command

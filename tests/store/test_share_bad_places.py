@@ -117,6 +117,17 @@ def test_what_was_made_from_a_damaged_artefact_is_left_out_of_all(
     assert {Path(line).name for line in pulled.out.split()} == set(other(tmp_path).ids())
 
 
+def test_a_damaged_manifest_here_leaves_the_others(irl, store, chain, tmp_path):
+    manifest = chain["airl"].directory / "manifest.json"
+    manifest.chmod(0o644)
+    manifest.write_bytes(b"")
+    pushed = irl("push", "--all", "--to", tmp_path / "other", "--store", store.root)
+    assert pushed.code == 4 and chain["airl"].id in pushed.err
+    assert set(other(tmp_path).ids()) == {chain["expert"].id, chain["demos"].id}
+    # It is still there, for `irl verify` to report.
+    assert manifest.exists()
+
+
 def test_a_damaged_artefact_here_is_not_pushed(irl, store, chain, url):
     path = chain["demos"].directory / "f"
     path.chmod(0o644)
