@@ -126,7 +126,7 @@ def test_senseless_parameters_do_not_break_listing(irl, store_copy, publish, par
     ("kind", "code", "named"),
     [
         ("file", 2, "not a directory"),
-        ("foreign", 4, "not a store"),
+        ("foreign", 2, "not a store"),
         ("newer", 4, "format 7"),
         ("damaged", 4, "STORE"),
         ("too long", 2, "aaaa"),

@@ -119,7 +119,7 @@ WRONG = [
     ("train-airl --demos demos --penalty closed-form", 2, "'closed-form'"),
     ("train-airl --demos demos --method irm --penalty none --penalty-weight 3", 2, "no penalty"),
     ("train-airl --demos demos --set airl.learner=gial", 2, "'gial'"),
-    ("train-airl --demos demos --from {tmp}", 4, "{tmp}"),
+    ("train-airl --demos demos --from {tmp}", 2, "{tmp}"),
     ("train-airl --demos demos --from {tmp}/absent", 3, "absent"),
     ("train-airl --demos demos --profile huge", 2, "'huge'"),
     ("train-airl --demos demos --set airl.penalty_wieght=3", 2, "airl.penalty_wieght"),
