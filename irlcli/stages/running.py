@@ -167,7 +167,8 @@ def warn_of_shared_ends(job: Job, settings: Mapping[str, "Sequence[Trajectory]"]
             job.console.warn(
                 f"{early} of {len(episodes)} demonstrations in {text} end early: with "
                 "airl.shared_absorbing the reward cannot tell these ends, a landing for example, from a "
-                "fall; omit it, or leave them out with --set demonstrations.full_length=true"
+                "fall; if they are no falls, --set airl.shared_absorbing=none, otherwise leave them out "
+                "with --set demonstrations.full_length=true"
             )
 
 
