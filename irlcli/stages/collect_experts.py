@@ -176,8 +176,8 @@ def _episodes(job: Job, text: str, wanted: int) -> list[Trajectory]:
     raise StageFailed(
         f"{len(found)} of {_ATTEMPTS * wanted} episodes of the expert in {env} {text} last until the time "
         f"limit, but {wanted} are wanted",
-        "train the expert for longer, record fewer with --episodes, or omit "
-        "demonstrations.full_length",
+        "train the expert for longer, record fewer with --episodes, or any with "
+        "--set demonstrations.full_length=false",
     )
 
 
