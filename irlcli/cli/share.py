@@ -164,8 +164,8 @@ def _share(
             out.print_data(path)
     if left_out:
         raise IntegrityError(
-            f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, because of "
-            f"damaged files: {', '.join(left_out)}",
+            f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, damaged or made from "
+            f"damaged ones: {', '.join(left_out)}",
             f"remove the damaged ones, which the warnings name, in {source.root}; then compute or push "
             "them again",
             document,

@@ -127,7 +127,7 @@ def _with_ancestors(
         except IntegrityError as error:
             if not partial or isinstance(error, NewerFormat):
                 raise
-            warn(f"skipping artefact {artefact.id}: {error.message}")
+            warn(f"skipping artefact {artefact.id}, made from a damaged one: {error.message}")
             continue
         found |= {member.id: member for member in members}
     return list(found.values())
