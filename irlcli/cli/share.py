@@ -166,8 +166,7 @@ def _share(
         raise IntegrityError(
             f"{out.counted(len(left_out), 'artefact')} of {source.root} not copied, damaged or made from "
             f"damaged ones: {', '.join(left_out)}",
-            f"remove the damaged ones, which the warnings name, in {source.root}; then compute or push "
-            "them again",
+            _damaged_there(source),
             document,
         )
     if session.as_json:
@@ -217,4 +216,10 @@ def _copied(
 
 
 def _damaged_there(place: "Place") -> str:
-    return f"remove the artefact in {place.root}, then compute or push it again"
+    """What to do about damaged artefacts of ``place``."""
+    if not isinstance(place.root, os.PathLike):
+        return f"remove what is damaged in {place.root}, then push it again"
+    line = shlex.join(["irl", "verify", "--store", str(place.root)])
+    return (
+        f"`{line}` moves what is damaged to quarantine and prints the commands that make it again"
+    )

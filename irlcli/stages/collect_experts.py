@@ -170,8 +170,15 @@ def _episodes(job: Job, text: str, wanted: int) -> list[Trajectory]:
         if not p.full_length:
             return episodes
         found += [t for t in episodes if len(t) == p.environment.max_episode_steps]
-        job.console.progress(min(len(found), wanted), wanted, "episodes", {text: "of full length"})
+        recorded = wanted * (attempt + 1)
+        facts = {text: f"full length in {len(found)} of {recorded}"}
+        job.console.progress(min(len(found), wanted), wanted, "episodes", facts)
         if len(found) >= wanted:
+            if len(found) < recorded / 2:
+                job.console.warn(
+                    f"only {len(found)} of {recorded} episodes of the expert in {text} last until the time "
+                    "limit: demonstrations of full length may earn far more than its mean"
+                )
             return found[:wanted]
     raise StageFailed(
         f"{len(found)} of {_ATTEMPTS * wanted} episodes of the expert in {env} {text} last until the time "
