@@ -94,10 +94,12 @@ def weak_experts(
     for row in p.rows if has_held_out(p.measures) else ():
         expert = means.get((row.name, "expert"))
         others = _earned_in(row.unseen, points[points["row"] == row.name], p.methods)
-        if expert is not None and len(others) and others.max() > expert:
+        better = {} if expert is None else others[others > expert].to_dict()
+        if better:
+            listed = ", ".join(f"{agents} ({earned:.1f})" for agents, earned in better.items())
             found.append(
-                f"Weak expert: {row.name}: in {row.unseen} {others.idxmax()} earn {others.max():.1f}, "
-                f"that setting's own expert {expert:.1f}. That expert may not be the best policy known."
+                f"Weak expert: {row.name}: in {row.unseen} its own expert earns {expert:.1f}, less than "
+                f"{listed}. It may not be the best policy known."
             )
     return found
 

@@ -217,4 +217,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 40, run)
+STAGE = Stage("report", 41, run)

@@ -46,8 +46,8 @@ def test_an_expert_no_better_than_an_agent_that_learns_nothing(agent, expert, we
 @pytest.mark.parametrize(
     ("agent", "measure", "earned", "better"),
     [
-        ("reused", "ood", [90.0, 251.0], "episodes of the best training expert earn 251.0"),
-        ("irm", "transfer", [249.0, 252.0, 252.0], "AIRL-IRM's transfer policies earn 251.0"),
+        ("reused", "ood", [90.0, 251.0], "episodes of the best training expert (251.0)"),
+        ("irm", "transfer", [249.0, 252.0, 252.0], "AIRL-IRM's transfer policies (251.0)"),
         ("irm", "transfer", [200.0, 210.0, 339.0], None),
         ("reused", "id", [400.0, 400.0], None),
     ],
@@ -59,13 +59,20 @@ def test_an_expert_below_another_policy_is_named(agent, measure, earned, better)
     assert [better in c for c in named] == [True] * (better is not None)
 
 
+def test_every_method_whose_policies_beat_an_expert_is_named():
+    earned = {(BOUNCE, "erm", "transfer"): [260.0] * 3, (BOUNCE, "irm", "transfer"): [255.0] * 3}
+    found = build(*example(complete() | earned), {}, {}).caveats
+    (named,) = (c for c in found if c.startswith("Weak expert"))
+    assert "AIRL-ERM's transfer policies (260.0), AIRL-IRM's transfer policies (255.0)" in named
+
+
 def test_an_expert_below_a_variants_policies_is_named():
     returns = {(BOUNCE, "expert", "ood"): [250.0], (BOUNCE, "no ceiling", "transfer"): [999.0] * 3}
     variants = (Variant("full"), Variant("no ceiling", ("transfer.ceiling=none",)))
     names = tuple(v.name for v in variants)
     p, points = example(returns, variants=variants, methods=names, learned_by="erm")
-    (named,) = (c for c in build(p, points, {}, {}).caveats if "own expert 250.0" in c)
-    assert "no ceiling's transfer policies earn 999.0" in named
+    (named,) = (c for c in build(p, points, {}, {}).caveats if "own expert earns 250.0" in c)
+    assert "no ceiling's transfer policies (999.0)" in named
 
 
 @pytest.mark.parametrize(("bar", "low"), [(None, False), (250.0, False), (251.0, True)])
