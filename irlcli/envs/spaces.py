@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import closing
 
-from irlcli.envs.registration import make
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting
@@ -36,6 +35,9 @@ def check_spaces(env: str, settings: Sequence[Setting]) -> None:
 
 
 def _spaces(env: str, setting: Setting) -> tuple[object, int]:
+    # Loads Gymnasium, which shipped environments do not need to be compared.
+    from irlcli.envs.registration import make
+
     with closing(make(env, setting)) as world:
         assert world.observation_space.shape is not None
         return world.action_space, world.observation_space.shape[0]

@@ -8,6 +8,7 @@ from irlcli.configs import Config
 from irlcli.configs.load import field_of
 from irlcli.data.descriptions import DemonstrationSummary
 from irlcli.envs.registry import resolve
+from irlcli.envs.spaces import check_spaces
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.experiments.recordings import recorded
 from irlcli.experiments.references import output
@@ -35,7 +36,7 @@ def collect_experts(
 
     Raises:
         UsageError: no setting is named, or one is malformed or named twice; ``trust`` without
-            ``expert``.
+            ``expert``; settings whose actions or observations differ.
         NotFound: no such environment or expert.
         IntegrityError: an expert's .zip that is no archive.
     """
@@ -65,7 +66,8 @@ def collect_experts(
     request = collect_stage.request(
         env, settings, config, seed, counts, experts, trust, normalisers
     )
-    # Other settings' experts may be trained for hours before these files are loaded.
+    # Experts may be trained for hours before the stage compares spaces and loads these files.
+    check_spaces(env, settings)
     for source in experts.values():
         if source.path.suffix == ".zip" and not zipfile.is_zipfile(source.path):
             raise IntegrityError(

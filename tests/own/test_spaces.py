@@ -459,6 +459,8 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
     done = bench.irl(*COLLECT, "--intervention", "mass=2x,3x", "--name", "demos")
     error, hint = done.err.splitlines()[-2:]
     assert done.code == 2 and named in error and hint.startswith("hint: "), done.err
+    # Before the expert of 3x is trained.
+    assert "3x" not in bench.irl("ls", "--stage", "train-expert").out
     checked = bench.irl("envs", "check", "cart.toml")
     assert (
         checked.code == 1 and ("has actions in" if not observed else "numbers in an") in checked.out
