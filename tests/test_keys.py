@@ -738,6 +738,14 @@ def test_the_version_of_a_penalty_changes_the_keys_of_its_rewards_alone(monkeypa
     assert found["irmv1", 1] == found["irmv1", 2]
 
 
+def test_the_version_of_a_penalty_changes_the_keys_of_the_sweeps_that_fit_it(monkeypatch):
+    before = key(sweep(in_use()))
+    for penalty, fitted in (("irmv1", True), ("closed-form", True), ("vrex", False)):
+        with monkeypatch.context() as patch:
+            patch.setitem(PENALTIES, penalty, PENALTIES[penalty]._replace(version=2))
+            assert (key(sweep(in_use())) != before) == fitted, penalty
+
+
 # Their seeds are fields of their configs.
 SWEEPS = ("sweep-maxent", "figure2", "control", "control-labels", "control-maps")
 

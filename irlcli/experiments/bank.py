@@ -47,6 +47,7 @@ class Policies(NamedTuple):
         reused: experts of other settings, by the setting each was trained in.
         experts: each setting's own, by setting.
         retrained: by the setting of the training.
+        substitutes: settings whose expert is not the one behind their demonstrations.
     """
 
     clone: Source | From | None
@@ -54,6 +55,7 @@ class Policies(NamedTuple):
     reused: Mapping[str, Source | From]
     experts: Mapping[str, Source | From]
     retrained: Mapping[str, Sequence[Member]]
+    substitutes: Sequence[str] = ()
 
 
 def bank(
@@ -141,17 +143,21 @@ class Finder:
             request = clone.request(demos, env, imitated, self._config, seed)
             imitation = From(request, "policy.pt")
         demonstrated = self.demonstrations(reward)
-        experts = {}
+        experts, substitutes = {}, []
         for text in dict.fromkeys([*origin.settings, *map(str, settings)]):
-            expert = self._expert(env, text, demonstrated)
+            recorded = _recorded(demonstrated, text)
+            expert = self._expert(env, text, recorded)
             if expert is not None:
                 experts[text] = expert
+                if recorded is not None and self._sha(expert) != recorded:
+                    substitutes.append(text)
         return Policies(
             clone=imitation,
             student=self._student(reward, origin),
             reused={text: experts[text] for text in origin.settings if text in experts},
             experts=experts,
             retrained={str(s): self._retrained(reward, str(s)) for s in settings},
+            substitutes=substitutes,
         )
 
     def _maker(self, reward: Source) -> Artefact | None:
@@ -165,12 +171,11 @@ class Finder:
         holders = [] if sha is None else self._index.holders(sha)
         return source_in(holders[0], output) if holders else None
 
-    def _expert(self, env: str, text: str, demos: Source | None) -> Source | From | None:
-        """The expert behind the demonstrations, or else the one that the config asks for."""
-        if demos is not None and demos.artefact is not None:
-            expert = self._input(demos.artefact, f"expert {text}", "policy.pt")
-            if expert is not None:
-                return expert
+    def _expert(self, env: str, text: str, recorded: str | None) -> Source | From | None:
+        """The expert with the digest ``recorded``, or else the one that the config asks for."""
+        holders = [] if recorded is None else self._index.holders(recorded)
+        if holders:
+            return source_in(holders[0], "policy.pt")
         request = train_expert.demonstrator(env, parse_setting(env, text), self._config)
         step = self._lookup(request)
         if step.artefact is None:
@@ -178,6 +183,13 @@ class Finder:
         # A HIT is equal to the same expert behind the demonstrations.
         hit = step.status == "HIT"
         return source_in(step.artefact, "policy.pt") if hit else From(request, "policy.pt")
+
+    def _sha(self, expert: Source | From) -> str:
+        if isinstance(expert, Source):
+            return expert.sha256
+        artefact = self._lookup(expert.request).artefact
+        assert artefact is not None
+        return artefact.output("policy.pt").sha256
 
     def _student(self, reward: Source, origin: Reward) -> Source | None:
         maker = self._maker(reward)
@@ -205,3 +217,10 @@ class Finder:
                 kind = "from-student" if "start" in record_.inputs else "retrained"
                 found.append(Member(name, kind, policy, ceiling=ceiling))
         return sorted(found, key=lambda member: member.name)
+
+
+def _recorded(demos: Source | None, setting: str) -> str | None:
+    """The digest of the expert behind the demonstrations of ``setting``; None if they record none."""
+    if demos is None or demos.artefact is None:
+        return None
+    return demos.artefact.manifest.record.inputs.get(f"expert {setting}")

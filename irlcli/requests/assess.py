@@ -65,7 +65,7 @@ def assess(
             "the bank has no noisy clones: the store lacks the demonstrations that this reward "
             "was learned from; name them with --demos"
         )
-    _warn_of_missing_experts(session, origin.env, settings, policies)
+    _warn_of_experts(session, origin.env, settings, policies)
     request = stage.request(
         source,
         origin.env,
@@ -102,9 +102,14 @@ def _given(
     return source, tuple(settings)
 
 
-def _warn_of_missing_experts(
+def _warn_of_experts(
     session: StageSession, env: str, settings: Sequence[Setting], policies: bank.Policies
 ) -> None:
+    for setting in policies.substitutes:
+        session.console.warn(
+            f"the expert of {setting} in the bank is not the one who demonstrated, which no artefact of "
+            "the store holds: regret and verdicts refer to the one in the bank"
+        )
     named = env if environment(env).own is None else _file(env) or "FILE.toml"
     for setting in map(str, settings):
         if setting not in policies.experts:

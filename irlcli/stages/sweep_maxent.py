@@ -7,11 +7,13 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec import UNSET, UnsetType
 from msgspec.structs import asdict, replace
 
 from irlcli.configs import Config, Figure2Config, GridworldConfig, MaxEntConfig
 from irlcli.configs.relevance import relevant_maxent
 from irlcli.interventions import Setting, check_tabular
+from irlcli.penalties import penalty_version
 from irlcli.stages import collect_experts
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
 from irlcli.stages.running import warn_of_labels
@@ -52,6 +54,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     """What the sweep depends on, besides its datasets (``seeds``, in the order of the inputs).
 
     ``shared`` has the hyperparameters of all variants; what they replace is at its default.
+    ``penalty_versions`` has the penalties whose version is not 1.
     """
 
     environment: EnvironmentKey
@@ -61,6 +64,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     variants: tuple[SweepVariant, ...]
     gridworld: GridworldConfig
     shared: MaxEntConfig
+    penalty_versions: dict[str, int] | UnsetType = UNSET
 
 
 def variants(penalty_weights: Sequence[float], l2s: Sequence[float]) -> tuple[SweepVariant, ...]:
@@ -87,6 +91,11 @@ def _shared(config: Config) -> MaxEntConfig:
     )
     relevant = relevant_maxent(replace(config.maxent, **asdict(penalised)))
     return replace(relevant, **asdict(SweepVariant(grouping="pooled")))
+
+
+def _penalty_versions() -> dict[str, int]:
+    found = {name: penalty_version(name) for name in FIGURE2_PENALTIES}
+    return {name: version for name, version in found.items() if isinstance(version, int)}
 
 
 def _datasets(env: str, settings: Sequence[Setting], config: Config) -> dict[int, Request]:
@@ -120,6 +129,7 @@ def request(
         variants=variants(config.figure2.penalty_weights, config.figure2.l2s),
         gridworld=config.gridworld,
         shared=_shared(config),
+        penalty_versions=_penalty_versions() or UNSET,
     )
     inputs = {f"demonstrations {seed}": From(demos) for seed, demos in requests.items()}
     label = f"sweep-maxent {env} {', '.join(texts)} {len(requests)} datasets"

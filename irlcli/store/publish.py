@@ -123,8 +123,10 @@ def _holder(layout: Layout, key: str) -> Artefact | None:
     if holder is not None:
         return holder
     with repairing(layout):
-        # Checked again under the lock: another process may have made a valid claim meanwhile.
-        id16 = held_by(layout, key)
-        if id16 is None or read_artefact(layout.root / id16).manifest.record.key != key:
-            pointer.unlink(missing_ok=True)
+        # Checked again under the lock: another process may have made a valid claim meanwhile, or
+        # removed this one, so that a third is making a valid claim now, which needs no lock.
+        if os.path.lexists(pointer):
+            id16 = held_by(layout, key)
+            if id16 is None or read_artefact(layout.root / id16).manifest.record.key != key:
+                pointer.unlink(missing_ok=True)
     return None

@@ -246,3 +246,24 @@ def test_a_file_that_is_no_archive_is_refused_before_other_experts_are_trained(b
     done = bench.irl(*COLLECT, *given)
     assert done.code == 4 and "text.zip was not saved by stable-baselines3" in done.err
     assert not list(Store("runs").artefacts())
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_bank_says_if_its_expert_is_not_the_one_who_demonstrated(bench, own):
+    given = ()
+    if own:
+        trained("PPO", cart(), "expert.zip")
+        given = ("--expert", "mass=1x=expert.zip", "--trust")
+    where = ("--intervention", "mass=1x")
+    smoke = ("--profile", "smoke")
+    for line in (
+        (*COLLECT, *where, *given, "--name", "demos"),
+        ("train-airl", "--demos", "demos", "--method", "erm", "--name", "erm", *smoke),
+        ("evaluate", "--expert", "--env", "cart.toml", "--setting", "mass=1x", *smoke),
+    ):
+        done = bench.irl(*line)
+        assert done.code == 0, done.err
+    assessed = bench.irl("assess", "erm", *smoke)
+    assert assessed.code == 0, assessed.err
+    assert ("of mass=1x in the bank is not the one who demonstrated" in assessed.err) == own
