@@ -82,6 +82,7 @@ def print_assessment(assessment: Assessment) -> None:
     out.print_table(columns, rows, stderr=True, optional=("progress",))
     out.print_note(
         "±: standard error over episodes; [low, high]: 95 % interval"
+        + ("; learned returns above are without the ceiling" if _bounded(assessment) else "")
         + ("; in all settings a policy counts once for each" if assessment.pooled else "")
     )
     ranked = ["policies", "Spearman", "Pearson"]
@@ -116,6 +117,10 @@ def print_assessment(assessment: Assessment) -> None:
             "ceiling",
         ]
         out.print_table(columns, splits, stderr=True)
+
+
+def _bounded(assessment: Assessment) -> bool:
+    return any(r.ceiling is not None for s in assessment.settings for r in s.retrained)
 
 
 def _verdict(of: RegretSplit) -> str:

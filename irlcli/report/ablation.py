@@ -25,8 +25,8 @@ _COLOUR = "#0072B2"
 _NOTE = (
     "{method}. True return in the settings trained on, as a share of that setting's own expert: mean ± standard "
     "deviation over seeds of the reward learning, then each seed. Retrained: policies trained from "
-    "scratch on the frozen reward; all settings: their mean, of seeds that have all of them. Student: "
-    "the policy trained while the reward was learned. Progress: the retrained policies' share of the "
+    "scratch on the frozen reward; all settings: their mean, of seeds that have all of them. Reached: "
+    "seeds whose policies reach this share in every setting. Student: the policy trained while the reward was learned. Progress: the retrained policies' share of the "
     "experts' progress. Difference: of the retrained policies' shares to those of {base}, in "
     "percentage points, over the seeds that both have (their number in brackets). p: paired t-test on "
     "these seeds, two-sided; Holm: adjusted over the variants that have a p-value."
@@ -34,7 +34,7 @@ _NOTE = (
 
 
 def _passed(gate: float) -> str:
-    """The column with the number of seeds that reach ``gate``."""
+    """The column with the number of seeds that reach ``gate`` in every setting."""
     return f"passed_{100 * gate:.0f}"
 
 
@@ -67,8 +67,8 @@ def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
 
     Columns: ``row``, ``agent``, ``overrides``; ``seeds`` retrained in all training settings,
     ``mean`` and ``deviation`` (n - 1) over them of the mean share over settings, ``progress``, that
-    of the progress; ``passed_80`` and ``passed_90``, the seeds that reach a gate; ``student``, the
-    mean share of the students; ``difference`` to the first variant over the ``pairs`` seeds that
+    of the progress; ``passed_80`` and ``passed_90``, the seeds that reach a gate in every setting;
+    ``student``, the mean share of the students; ``difference`` to the first variant over the ``pairs`` seeds that
     both have, its ``p_paired`` and ``p_paired_holm`` over the row's variants.
 
     Args:
@@ -81,6 +81,7 @@ def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
         lines = []
         for variant in p.variants:
             values = retrained[variant.name]
+            least = _by_setting(found, row, variant.name, _RETRAINED, "share").min(axis=1)
             s = summarise(values.tolist())
             common = values.index.intersection(base.index)
             compared = variant != p.variants[0] and len(common) > 0
@@ -94,7 +95,7 @@ def summarise_variants(p: Parameters, found: pd.DataFrame) -> pd.DataFrame:
                     "seeds": s.n,
                     "mean": s.mean,
                     "deviation": s.deviation,
-                    **{_passed(gate): int((values >= gate).sum()) for gate in GATES},
+                    **{_passed(gate): int((least >= gate).sum()) for gate in GATES},
                     "progress": progress.mean(),
                     "student": student.mean(),
                     "difference": (values[common] - base[common]).mean() if compared else None,
@@ -114,9 +115,16 @@ def over_settings(
     found: pd.DataFrame, row: Row, variant: str, measure: str, column: str = "share"
 ) -> pd.Series:
     """The mean share over ``row``'s training settings by seed, of seeds that have all of them."""
+    return _by_setting(found, row, variant, measure, column).mean(axis=1)
+
+
+def _by_setting(
+    found: pd.DataFrame, row: Row, variant: str, measure: str, column: str
+) -> pd.DataFrame:
+    """The shares by seed and training setting, of seeds that have all settings."""
     chosen = points_of(found, row.name, variant, measure)
     by_seed = chosen.pivot(index="seed", columns="setting", values=column)
-    return by_seed.reindex(columns=list(row.trained)).dropna().mean(axis=1)
+    return by_seed.reindex(columns=list(row.trained)).dropna()
 
 
 def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Table]:
@@ -142,7 +150,7 @@ def tables(p: Parameters, found: pd.DataFrame, summary: pd.DataFrame) -> list[Ta
             for r in summary[summary["row"] == row.name].itertuples()
         ]
         columns = ["variant", "changes", *row.trained, "all settings"]
-        columns += [" and ".join(f"{gate:.0%}" for gate in GATES) + " reached"]
+        columns += [" and ".join(f"{100 * gate:.0f} %" for gate in GATES) + " reached"]
         columns += ["progress", "student", "difference", "p", "Holm"]
         result.append(Table(f"Retrained in distribution: {row.name}", note, columns, lines, 2))
         note = ""

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from irlcli.report.agents import IN_DISTRIBUTION, title
-from irlcli.report.compute import IMITATED, Assessments, failed_to_imitate
+from irlcli.report.compute import Assessments, failed_to_imitate
 from irlcli.report.lineage import is_mixed, lineage, origins, short
 from irlcli.report.parameters import EXPERT_BY_REWARD, Cell, Code, Parameters, has_held_out
 from irlcli.report.statistics import identical_runs
@@ -62,9 +62,9 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
             least = r.least_of_expert
             share = "" if least is pd.NA else f" ({least:.1%} of its return)"
             found.append(
-                f"Not imitated: {r.row}, {title(r.agent)}: in a training setting the student stays "
-                f"below {IMITATED:.0%} of the expert{share}, in the mean over seeds. Do not interpret gaps "
-                "to other methods."
+                f"Not imitated: {r.row}, {title(r.agent)}: in a training setting the student earns over a "
+                f"fifth less than the expert{share}, in the mean over seeds. Do not interpret gaps to other "
+                "methods."
             )
     return found
 

@@ -14,7 +14,7 @@ from irlcli.labels import duration, steps, steps_of_all_restarts
 from irlcli.methods import METHODS
 from irlcli.report import paper
 from irlcli.report.agents import IN_DISTRIBUTION, MEASURES, PROGRESS, beside, own_measure, title
-from irlcli.report.compute import IMITATED, failed_to_imitate
+from irlcli.report.compute import failed_to_imitate
 from irlcli.report.lineage import commits, lineage
 from irlcli.report.parameters import Parameters, Row, Run
 from irlcli.report.tables import EVERY_CELL, REWARD_QUALITY, Table
@@ -33,7 +33,7 @@ _TEST_NOTE = (
 _MARKS = {
     r"\(\d+/\d+\)": "(3/5): three of five seeds exist.",
     r"\(part\)": "(part): some evaluations are missing; differences and p-values leave their seeds out.",
-    "†": f"† in a training setting the student stays below {IMITATED:.0%} of the expert.",
+    "†": "† in a training setting the student earns over a fifth less than the expert.",
     "‡": "‡ runs of more than one commit or set of libraries.",
     "^progress$": PROGRESS,
     "^ant ": "An idle ant earns about 600.",

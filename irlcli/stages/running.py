@@ -213,7 +213,10 @@ def _report(job: Job, training: "Training | Restarts", newest: "list[Row]") -> N
         facts["discriminator"] = f"accuracy {accuracy:.2f}"
     if "challenger_return" in newest[0]:
         # In the order of the settings.
-        facts["challenger"] = "return " + ", ".join(f"{r['challenger_return']:.0f}" for r in newest)
+        returns = [row["challenger_return"] for row in newest]
+        facts["challenger"] = "return " + ", ".join(
+            "-" if isnan(r) else f"{r:.0f}" for r in returns
+        )
     job.console.progress(training.steps, training.planned_steps, "steps", facts)
     scalars = {
         f"{row['setting']}/{name}": float(value)

@@ -26,7 +26,7 @@ def test_a_complete_table_has_no_caveats():
 def test_a_student_that_did_not_imitate():
     found = build(*example(complete(student=199.0)), {}, {}).caveats
     (marked,) = (c for c in found if c.startswith(f"Not imitated: {BOUNCE}, AIRL-ERM"))
-    assert "80% of the expert (79.6% of its return)" in marked
+    assert "over a fifth less than the expert (79.6% of its return)" in marked
 
 
 @pytest.mark.parametrize(("expert", "weak"), [(99.0, True), (100.0, True), (101.0, False)])
