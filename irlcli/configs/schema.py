@@ -252,8 +252,8 @@ class AIRLConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         gradient_penalty: weight of the mean squared gradient of g by its input, between the
             policy's samples and the expert's. It keeps g from saturating.
         weight_decay: decoupled (AdamW), so that its strength does not depend on lambda.
-        batch_size: demonstrated samples of the discriminator's minibatch, per setting; as many are the
-            policy's.
+        batch_size: demonstrated samples of the discriminator's minibatch, per setting. The policy has as
+            many samples.
         replay_share: share of the discriminator's policy samples that come from past rounds;
             each round adds ``replay_episodes_per_round`` episodes a setting, of which
             ``replay_capacity`` are kept.

@@ -7,10 +7,10 @@ last entries of the observation:
 - the *texture* agrees with the quality in 75 % of the steps, in every setting;
 - the *cue* agrees with it in a share of the steps that is the setting, ``cue-strength``.
 
-A hint is +1 or -1. Whether it is right is drawn anew at every step, from the episode's seed alone,
-whoever acts: demonstrations and rollouts get their cues by one rule. Nothing else changes, so
-an expert of the world without the cue demonstrates, and :func:`with_hints` adds what a learner would
-have seen.
+A hint is +1 or -1. Whether it is right is drawn anew at every step, from a random stream of the
+world's seed, whoever acts: demonstrations and rollouts get their cues by one rule. Nothing else
+changes, so an expert of the world without the cue demonstrates, and :func:`with_hints` adds what a
+learner would have seen.
 """
 
 from __future__ import annotations

@@ -283,7 +283,7 @@ class Lab:
             policy: a policy, or an artefact with one. Or one of ``expert=True`` (the expert of each
                 setting), ``random=True`` and ``idle=True``.
             ood, intervention, setting: settings; by default those the policy was trained in.
-            trained_in: with ``expert``: the experts of these settings, each in all of the others.
+            trained_in: with ``expert``: the experts of these settings, each in every setting named.
             reward: a learned reward that also scores the episodes.
             env: the environment of experts and baselines.
             episodes: per setting.
@@ -321,7 +321,7 @@ class Lab:
             demos: demonstrations to clone for the bank; by default the reward's own.
             env: TOML file of the environment, for a reward outside the store.
             episodes: of each policy.
-            seed: of the episodes.
+            seed: of the episodes, and of the clone's training.
             name: to give the artefact.
             configs: ``profile``, ``settings`` and ``set`` of this call.
         """

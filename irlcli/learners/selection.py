@@ -1,7 +1,7 @@
 """Which round of adversarial training to keep, by in-distribution data that was held out.
 
-Adversarial training has no loss that falls, so the last round is not the best one. It may be
-selected by data of the settings trained on, never by the setting that a method is judged in.
+Adversarial training has no loss that falls, so the last round need not be the best one. A round may
+be selected by data of the settings trained on, never by the setting that a method is judged in.
 """
 
 from __future__ import annotations
