@@ -101,6 +101,7 @@ def print_assessment(assessment: Assessment) -> None:
             r.policy,
             _measured(r.true_regret),
             _measured(r.learned_gap),
+            "-" if r.discounted_gap is None else _measured(r.discounted_gap),
             _verdict(r),
             "-" if r.ceiling is None else f"{r.ceiling:g}",
         ]
@@ -113,6 +114,7 @@ def print_assessment(assessment: Assessment) -> None:
             "retrained policy",
             "true regret",
             "learned gap",
+            "discounted gap",
             "verdict",
             "ceiling",
         ]

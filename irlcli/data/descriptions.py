@@ -246,11 +246,13 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
     Attributes:
         true_regret: true return of the expert minus the policy's.
         learned_gap: learned return of the expert minus the policy's, both under ``ceiling``.
+        discounted_gap: the same of discounted returns, which the policy's training maximises.
         ceiling: of the rewards that the policy was trained on, as a quantile of g on the
             demonstrations; None without.
         verdict: None where the expert earns no more than the random agent.
         clear: whether the differences that decide the verdict exceed two standard errors: of the
-            regret to the allowed one and, unless it matches the expert, of the learned returns.
+            regret to the allowed one and, unless it matches the expert, of the learned returns, whose
+            two gaps must then have the same sign.
         from_student: whether the policy began as the reward's student.
     """
 
@@ -261,6 +263,7 @@ class RegretSplit(Struct, frozen=True, kw_only=True):
     clear: bool
     ceiling: Finite | None = None
     from_student: bool = False
+    discounted_gap: Measured | None = None
 
 
 class BankEntry(Struct, frozen=True, kw_only=True):

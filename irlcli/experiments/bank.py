@@ -6,7 +6,7 @@ those that exist are measured.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from irlcli import labels
 from irlcli.configs import Config
@@ -29,6 +29,7 @@ class Member(NamedTuple):
         policy: None for an agent without one.
         noise: that is added to its actions.
         ceiling: of the rewards it was retrained on; None without.
+        gamma: of its training; None if it was not retrained.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Member(NamedTuple):
     policy: Source | From | None = None
     noise: float = 0.0
     ceiling: float | None = None
+    gamma: float | None = None
 
 
 class Policies(NamedTuple):
@@ -66,7 +68,11 @@ def bank(
     for setting in settings:
         for member in _members(str(setting), config, policies):
             entry = Entry(
-                policy=member.name, kind=member.kind, setting=str(setting), ceiling=member.ceiling
+                policy=member.name,
+                kind=member.kind,
+                setting=str(setting),
+                ceiling=member.ceiling,
+                gamma=member.gamma,
             )
             found[entry] = record.request(
                 env,
@@ -213,9 +219,10 @@ class Finder:
             ):
                 name = f"retrained {artefact.id[:8]} {labels.retrained_as(record_)}".strip()
                 policy = source_in(artefact, "policy.pt")
-                ceiling = record_.parameters["transfer"].get("ceiling")
+                trained = record_.parameters["transfer"]
                 kind = "from-student" if "start" in record_.inputs else "retrained"
-                found.append(Member(name, kind, policy, ceiling=ceiling))
+                ceiling, gamma = trained.get("ceiling"), _gamma(trained)
+                found.append(Member(name, kind, policy, ceiling=ceiling, gamma=gamma))
         return sorted(found, key=lambda member: member.name)
 
 
@@ -224,3 +231,10 @@ def _recorded(demos: Source | None, setting: str) -> str | None:
     if demos is None or demos.artefact is None:
         return None
     return demos.artefact.manifest.record.inputs.get(f"expert {setting}")
+
+
+def _gamma(transfer: Mapping[str, Any]) -> float | None:
+    """The discount in the recorded parameters of a transfer; None where they have none."""
+    learner = transfer.get("sac" if transfer.get("algorithm") == "sac" else "ppo")
+    gamma = learner.get("gamma") if isinstance(learner, dict) else None
+    return gamma if isinstance(gamma, int | float) else None

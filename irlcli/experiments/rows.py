@@ -315,6 +315,7 @@ def _run(
                     "from-student" if measure == "from-student" else "retrained",
                     From(moved, "policy.pt"),
                     ceiling=moved.parameters.transfer.ceiling,
+                    gamma=moved.parameters.transfer.algorithm_config.gamma,
                 )
                 retrained.setdefault(str(setting), []).append(member)
     if "transfer" in measures:

@@ -66,6 +66,7 @@ class FrozenReward:
         self._model = model
         self._scale = origin.scale
         self._horizon = horizon
+        self._gamma = gamma
         self._absorbing = origin.airl.fixed_horizon
         self._view = ActionView(origin.airl.actions, actions)
         #: :meth:`of_steps` of tensors.
@@ -101,6 +102,16 @@ class FrozenReward:
         """
         data = self._view.of(transitions([trajectory], self._horizon))
         return episode_reward(self._model, data, self._absorbing, self._ceiling) / self._scale
+
+    def discounted(self, trajectory: Trajectory) -> float:
+        """The discounted learned return of an episode: what a policy's training maximises.
+
+        Where absorbing states were learned, the final one has its infinite series. What would follow
+        the time limit is left out.
+        """
+        data = transitions([trajectory], self._horizon)
+        steps = data.observations, data.actions, data.next_observations, data.terminated
+        return float(self._gamma ** np.arange(len(trajectory)) @ self.of_steps(*steps))
 
 
 def actions_in_words(discrete: bool, size: int, choices: Sequence[int]) -> str:

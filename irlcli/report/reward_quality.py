@@ -43,8 +43,8 @@ class Member(NamedTuple):
         steps: [n], over which the learned return sums, absorbing ones included.
         progress: mean over the episodes; None if the environment reports none.
         ceiling: of the rewards that a retrained policy was trained on; None without.
-        bounded, expert_bounded: learned returns [n] of a retrained policy and of the setting's expert
-            under its ceiling; None without one.
+        gap, discounted_gap: of a retrained policy, the expert's learned return minus its own [n],
+            under its ceiling: of plain sums, and of the discounted ones that its training maximises.
     """
 
     policy: str
@@ -55,8 +55,8 @@ class Member(NamedTuple):
     steps: np.ndarray
     progress: float | None = None
     ceiling: float | None = None
-    bounded: np.ndarray | None = None
-    expert_bounded: np.ndarray | None = None
+    gap: np.ndarray | None = None
+    discounted_gap: np.ndarray | None = None
 
 
 class Judgement(NamedTuple):
@@ -196,7 +196,9 @@ def return_distance(members: Sequence[Member]) -> float | None:
 # What a retrained policy fell short of
 
 
-def judge(regret: Measured, margin: float, gap: Measured) -> Judgement:
+def judge(
+    regret: Measured, margin: float, gap: Measured, discounted_gap: Measured | None = None
+) -> Judgement:
     """Why a retrained policy does not earn what the expert earns, if it does not.
 
     None where the expert earns no more than the random agent. ``matches the expert``: its regret is within
@@ -208,6 +210,7 @@ def judge(regret: Measured, margin: float, gap: Measured) -> Judgement:
         regret: true return of the expert minus the policy's.
         margin: true return of the expert minus the random agent's.
         gap: learned return of the expert minus the policy's.
+        discounted_gap: the same of discounted returns; with another sign, the verdict is not clear.
     """
     if margin <= 0.0:
         return Judgement(None, False)
@@ -215,7 +218,8 @@ def judge(regret: Measured, margin: float, gap: Measured) -> Judgement:
     if beyond <= 0.0:
         return Judgement("matches the expert", _is_clear(beyond, regret))
     verdict: Verdict = "wrong reward" if gap.mean <= 0.0 else "optimisation fell short"
-    return Judgement(verdict, _is_clear(beyond, regret) and _is_clear(gap.mean, gap))
+    agree = discounted_gap is None or (discounted_gap.mean > 0.0) == (gap.mean > 0.0)
+    return Judgement(verdict, agree and _is_clear(beyond, regret) and _is_clear(gap.mean, gap))
 
 
 def _is_clear(margin: float, of: Measured) -> bool:
@@ -228,15 +232,16 @@ def split_regret(policy: Member, expert: Member, random: Member) -> RegretSplit:
     Learned returns are those that the policy was trained for: under its ceiling, if it has one.
     Standard errors are of paired differences, because episode k starts from the same state for all.
     """
-    bounded = policy.learned if policy.bounded is None else policy.bounded
-    expert_bounded = expert.learned if policy.expert_bounded is None else policy.expert_bounded
-    regret, gap = measured(expert.true - policy.true), measured(expert_bounded - bounded)
+    regret = measured(expert.true - policy.true)
+    gap = measured(expert.learned - policy.learned if policy.gap is None else policy.gap)
+    discounted = None if policy.discounted_gap is None else measured(policy.discounted_gap)
     margin = float(expert.true.mean() - random.true.mean())
-    verdict, clear = judge(regret, margin, gap)
+    verdict, clear = judge(regret, margin, gap, discounted)
     return RegretSplit(
         policy=policy.policy,
         true_regret=regret,
         learned_gap=gap,
+        discounted_gap=discounted,
         verdict=verdict,
         clear=clear,
         ceiling=policy.ceiling,

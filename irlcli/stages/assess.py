@@ -25,12 +25,16 @@ if TYPE_CHECKING:
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """A policy of the bank in one setting; see :class:`irlcli.report.reward_quality.Member`."""
+    """A policy of the bank in one setting; see :class:`irlcli.report.reward_quality.Member`.
+
+    ``ceiling`` and ``gamma`` are those of a retrained policy's training.
+    """
 
     policy: str
     kind: str
     setting: str
     ceiling: float | None = None
+    gamma: float | None = None
 
     @property
     def role(self) -> str:
@@ -84,21 +88,29 @@ def run(job: Job) -> None:
     episodes = {entry: _episodes(job, entry) for entry in p.bank}
     experts = {entry.setting: entry for entry in p.bank if entry.kind == "expert"}
 
-    def returns(entry: Entry, ceiling: float | None = None) -> np.ndarray:
-        frozen = frozen_reward(p.environment, entry.setting, model, origin, ceiling)
+    def returns(entry: Entry) -> np.ndarray:
+        frozen = frozen_reward(p.environment, entry.setting, model, origin)
         return np.array([frozen.of_episode(t) for t in episodes[entry]])
+
+    def gaps(entry: Entry, expert: Entry) -> tuple[np.ndarray, np.ndarray]:
+        """The expert's learned returns minus those of a retrained policy, plain and discounted."""
+        frozen = frozen_reward(
+            p.environment, entry.setting, model, origin, entry.ceiling, entry.gamma
+        )
+        plain, discounted = (
+            [of(e) - of(t) for e, t in zip(episodes[expert], episodes[entry], strict=True)]
+            for of in (frozen.of_episode, frozen.discounted)
+        )
+        return np.array(plain), np.array(discounted)
 
     members, rows = [], []
     for index, entry in enumerate(p.bank):
         # What an absorbing state earns counts up to the horizon.
         horizon = p.environment.max_episode_steps if origin.airl.fixed_horizon else None
         member = _member(job, entry, episodes[entry], returns(entry), horizon)
-        if entry.ceiling is not None and entry.setting in experts:
-            member = member._replace(
-                ceiling=entry.ceiling,
-                bounded=returns(entry, entry.ceiling),
-                expert_bounded=returns(experts[entry.setting], entry.ceiling),
-            )
+        if entry.gamma is not None and entry.setting in experts:
+            gap, discounted = gaps(entry, experts[entry.setting])
+            member = member._replace(ceiling=entry.ceiling, gap=gap, discounted_gap=discounted)
         members.append(member)
         rows += _rows(member, episodes[entry])
         job.console.progress(index + 1, len(p.bank), "policies", {})
@@ -188,4 +200,4 @@ def _epic_distances(
     return found, ""
 
 
-STAGE = Stage("assess", 6, run, reads=("assessment",))
+STAGE = Stage("assess", 7, run, reads=("assessment",))

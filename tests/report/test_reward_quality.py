@@ -265,6 +265,21 @@ def test_episodes_from_one_start_are_compared_with_each_other():
     assert (split.verdict, split.clear) == ("wrong reward", True)
 
 
+@pytest.mark.parametrize(("discounted", "clear"), [(3.0, True), (-3.0, False)])
+@pytest.mark.parametrize("gap", [5.0, -5.0])
+def test_a_verdict_is_uncertain_if_discounting_reverses_the_gap(gap, discounted, clear):
+    """Training maximises discounted returns, so it may have reached the best of them."""
+    known = Measured(mean=50.0, error=1.0)
+    of_gap = Measured(mean=gap, error=1.0)
+    sign = 1.0 if gap > 0 else -1.0
+    found = judge(known, 100.0, of_gap, Measured(mean=sign * discounted, error=1.0))
+    expected = "optimisation fell short" if gap > 0 else "wrong reward"
+    assert found == (expected, clear) and judge(known, 100.0, of_gap) == (expected, True)
+    # A policy that matches the expert does so whatever the reward says.
+    matching = judge(Measured(mean=0.0, error=1.0), 100.0, of_gap, Measured(mean=-gap, error=1.0))
+    assert matching == ("matches the expert", True)
+
+
 def test_a_single_episode_has_no_standard_error():
     assert measured(np.array([3.0])) == Measured(mean=3.0, error=None)
     split = split_regret(

@@ -205,10 +205,10 @@ def test_a_policy_trained_under_a_ceiling_is_judged_under_it(assessed, irl):
     model, origin = load_reward_file(Store(path).resolve("airl").artefact.directory / "reward.pt")
     level = origin.quantiles[30]
 
-    def learned(policy):
+    def learned(policy, of):
         sha = artefact.manifest.record.inputs[f"engine-power=1x {policy}"]
         recorded = read_demonstrations(Store(path).index().holders(sha)[0].directory)
-        return np.mean([bounded(t) for t in recorded.trajectories["engine-power=1x"]])
+        return np.mean([of(t) for t in recorded.trajectories["engine-power=1x"]])
 
     def bounded(t):
         with torch.no_grad():
@@ -218,11 +218,23 @@ def test_a_policy_trained_under_a_ceiling_is_judged_under_it(assessed, irl):
         rest = (1000 - len(t)) * t.terminated * final.clamp(max=level)
         return float(steps + rest) / origin.scale
 
+    def discounted(t):
+        """The absorbing state's series g + gamma g + ... begins a step after the last one."""
+        with torch.no_grad():
+            states, actions = torch.as_tensor(t.observations), torch.as_tensor(t.actions)
+            steps = model.reward(states[:-1], model.encode(actions)).clamp(max=level)
+            final, _ = model.absorbing_reward(states[-1:])
+        series = gamma ** len(t) / (1 - gamma) * t.terminated * final.clamp(max=level)
+        return float(gamma ** torch.arange(len(t)) @ steps + series) / origin.scale
+
     # Here the expert earns more than the random agent, so there is a verdict.
     assert split["verdict"] in irl("assess", "airl", *here).err
-    gap = learned("expert of engine-power=1x") - learned(split["policy"])
+    (policy,) = (a for a in Store(path).artefacts() if a.id[:8] == split["policy"].split()[1])
+    gamma = policy.manifest.record.parameters["transfer"]["ppo"]["gamma"]
     assert split["ceiling"] == 0.3
-    assert split["learned_gap"]["mean"] == pytest.approx(gap, rel=1e-4, abs=1e-3)
+    for name, of in (("learned_gap", bounded), ("discounted_gap", discounted)):
+        gap = learned("expert of engine-power=1x", of) - learned(split["policy"], of)
+        assert split[name]["mean"] == pytest.approx(gap, rel=1e-4, abs=1e-3), name
 
 
 def test_the_clone_imitates(assessed):
