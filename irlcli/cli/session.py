@@ -189,7 +189,18 @@ class StageSession(base.StageSession):
     def print_plan(self, steps: Sequence["Step"]) -> None:
         """A line for each step: its status, its label, and why."""
         if self.as_json:
-            plan = [{"status": s.status, "request": s.label, "why": s.why} for s in steps]
+            import msgspec
+
+            plan = [
+                {
+                    "status": s.status,
+                    "request": s.label,
+                    "why": s.why,
+                    "key": s.key,
+                    "parameters": msgspec.to_builtins(s.parameters),
+                }
+                for s in steps
+            ]
             out.print_json("plan", {"steps": plan})
             return
         for step in steps:

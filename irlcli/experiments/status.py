@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import msgspec
 
@@ -28,6 +28,7 @@ class Step(NamedTuple):
         why: the reason for the status.
         artefact: of a HIT or FOUND; the latter lies in the other store.
         key: unknown while an input is missing.
+        parameters: the request's, every one resolved.
     """
 
     status: Status
@@ -35,6 +36,7 @@ class Step(NamedTuple):
     why: str
     artefact: Artefact | None = None
     key: str | None = None
+    parameters: Any = None
 
 
 class Identities:
@@ -80,7 +82,8 @@ class Lookup:
             NewerFormat: a newer version wrote its artefact.
         """
         if id(request) not in self._steps:
-            self._steps[id(request)] = request, self._look_up(request)
+            step = self._look_up(request)._replace(parameters=request.parameters)
+            self._steps[id(request)] = request, step
         return self._steps[id(request)][1]
 
     def chain(self, request: Request) -> list[Step]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from irlcli import __version__
 from irlcli.cli.app import COMMANDS
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.methods import METHODS
+from irlcli.store import Store
 
 
 def test_without_arguments(irl):
@@ -141,3 +143,15 @@ def test_a_closed_pipe_is_quiet(smoke_store):
     err = process.stderr.read()
     process.stderr.close()
     assert (process.wait(), err) == (141, b"")
+
+
+def test_a_dry_run_prints_every_resolved_parameter(irl, smoke_store):
+    """Those that the artefact then has, and those of the steps before it."""
+    made = Store(smoke_store.path).resolve("airl").artefact.manifest.record
+    where = ["--store", smoke_store.path, "--profile", "smoke", "--dry-run", "--json"]
+    line = ["train-airl", "--demos", "demos", "--method", "irm", *where]
+    (hit,) = json.loads(irl(*line).out)["steps"]
+    assert (hit["status"], hit["key"]) == ("HIT", made.key)
+    assert hit["parameters"] == made.parameters
+    (new,) = json.loads(irl(*line, "--set", "airl.learning_rate=0.5").out)["steps"]
+    assert new["status"] == "RUN" and new["parameters"]["airl"]["learning_rate"] == 0.5
