@@ -61,7 +61,9 @@ def test_a_reward_may_share_one_absorbing_state(chain, irl):
         Store(chain).resolve("shared").artefact.directory / "reward.pt"
     )
     finals = torch.randn(10, description.network.observation_size)
-    assert len(absorbed(model, finals).unique()) == 1
+    rewards = absorbed(model, finals)
+    # Rows of a batch are rounded differently.
+    assert torch.allclose(rewards, rewards[0], atol=1e-6)
     done = irl(*train, "--set", "airl.shaping=true")
     assert done.code == 2 and "airl.shared_absorbing needs airl.shaping = false" in done.err
 
