@@ -6,7 +6,7 @@ settings, and the mean over all methods, seed by seed, of what retraining earns 
 (t-test). Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
 With ``--pool`` the reports are one: each has other seeds of the same rows, measured with the same
-experts.
+experts, and learned from the same demonstrations. The latter is not checked: reports do not hold it.
 """
 
 from __future__ import annotations
