@@ -134,6 +134,9 @@ def test_variants_are_compared_with_the_first_by_the_paired_test():
     assert no_ceiling["p_paired_holm"] == pytest.approx(2 * no_ceiling["p_paired"])
     assert no_challengers["p_paired_holm"] == pytest.approx(no_challengers["p_paired"])
     report = ablation(RETURNS)
+    # Welch's p of both variants are one family.
+    smaller = report.comparisons.sort_values("p_welch").iloc[0]
+    assert smaller["p_welch_holm"] == pytest.approx(2 * smaller["p_welch"])
     pairs = report.comparisons[["x", "y"]].drop_duplicates().to_numpy().tolist()
     assert pairs == [["no ceiling", "full"], ["no challengers", "full"]]
 

@@ -8,6 +8,7 @@ from report_examples import (
     BOUNCE,
     CONFIG,
     POWER,
+    ROWS,
     cell,
     complete,
     example,
@@ -95,6 +96,51 @@ def test_a_student_below_the_bar_has_not_imitated():
     assert cell(report, BOUNCE, "irm", "id")["imitated"]
     assert cell(report, BOUNCE, "erm", "id")["of_expert"] == pytest.approx(0.796)
     assert set(report.comparisons["not_imitated"]) == {"erm"}
+
+
+def test_a_student_must_imitate_in_every_training_setting():
+    """It earns 100 and 70 of the experts' 100; its three seeds count once."""
+    p, points = example(complete(), rows=ROWS[:1])
+    own = points["agent"].isin(["expert", "irm"]) & (points["measure"] == "id")
+    in_both = [
+        points[own].assign(
+            setting=setting,
+            true_return=[100.0 if agent == "expert" else earned for agent in points[own]["agent"]],
+        )
+        for setting, earned in (("bounce=0.1", 100.0), ("bounce=0.5", 70.0))
+    ]
+    found = cell(build(p, pd.concat([points[~own], *in_both]), {}, {}), BOUNCE, "irm", "id")
+    assert not found["imitated"]
+    assert found["of_expert"] == pytest.approx(0.85)
+    assert found["least_of_expert"] == pytest.approx(0.7)
+
+
+def test_a_negative_expert_has_no_share():
+    values = complete() | {(BOUNCE, "expert", "id"): [-250.0]}
+    assert cell(build(*example(values), {}, {}), BOUNCE, "irm", "id")["of_expert"] is pd.NA
+
+
+def test_the_paired_test_pairs_equal_seeds():
+    """The differences are 2, -1 and -1; those of the sorted returns would be zero."""
+    values = complete()
+    values[BOUNCE, "erm", "transfer"] = [1.0, 2.0, 3.0]
+    values[BOUNCE, "irm", "transfer"] = [3.0, 1.0, 2.0]
+    first = build(*example(values), {}, {}).comparisons.iloc[0]
+    assert first["p_paired"] == pytest.approx(1.0)
+
+
+def test_each_pair_of_methods_is_adjusted_over_the_rows_alone():
+    values = complete()
+    for row in (BOUNCE, POWER):
+        values[row, "irm-shuffled", "transfer"] = [0.0, 1.0, 9.0]
+        values[row, "irm-shuffled", "id"] = [240.0, 241.0, 242.0]
+    given = {"methods": ("erm", "irm", "irm-shuffled"), "measures": ("transfer",)}
+    two = build(*example(values, **given), {}, {}).comparisons
+    assert two["p_welch_holm"].tolist() == pytest.approx(
+        (2 * two["p_welch"]).clip(upper=1).tolist()
+    )
+    one = build(*example(values, rows=ROWS[:1], **given), {}, {}).comparisons
+    assert len(one) == 2 and one["p_welch_holm"].tolist() == one["p_welch"].tolist()
 
 
 def test_learned_returns_rank_policy_and_expert():

@@ -105,9 +105,10 @@ def test_returns_are_those_of_whole_episodes():
         start = end + 1
 
 
-def test_training_on_true_rewards_handed_in_equals_training_on_the_environments():
+@pytest.mark.parametrize("gamma", [0.99, 0.5])
+def test_training_on_true_rewards_handed_in_equals_training_on_the_environments(gamma):
     # Truncations (limit 50) and terminations both occur, so bootstrapping is compared as well.
-    plain, replaced = make_trainer(limit=50), make_trainer(limit=50)
+    plain, replaced = (make_trainer(limit=50, gamma=gamma) for _ in range(2))
     plain.train_round(0, TrueReward())
     replaced.train_round(0, Reward(lambda rollout: rollout.true_rewards.copy()))
     for a, b in zip(
