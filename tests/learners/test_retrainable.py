@@ -292,6 +292,22 @@ def numbers_of(demos):
     return np.concatenate([t.observations.ravel() for group in demos for t in group])
 
 
+def test_a_ceiling_is_a_quantile_over_the_demonstrations_of_all_settings(demos):
+    _, learner, _ = challenged(demos, fixed_horizon=False)
+    with torch.no_grad():
+        g = [
+            learner.model.reward(
+                torch.as_tensor(t.observations[:-1]),
+                learner.model.encode(torch.as_tensor(t.actions)),
+            )
+            for group in demos
+            for t in group
+        ]
+    every = torch.cat(g)
+    assert learner.quantiles[0] == pytest.approx(float(every.min()), rel=1e-5)
+    assert learner.quantiles[-1] == pytest.approx(float(every.max()), rel=1e-5)
+
+
 def test_a_challenger_is_paid_the_bounded_reward(demos):
     trainer, learner, _ = challenged(demos, fixed_horizon=False)
     (rollout,) = trainer.train_round(0, learner)
