@@ -83,6 +83,37 @@ def test_the_gradient_is_penalised_between_policy_and_expert():
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
 
 
+def test_the_points_of_the_gradient_penalty_are_drawn_anew_along_the_lines():
+    """From the policy's sample at share 0 to the expert's at 1, by the round's generator."""
+    torch.manual_seed(1)
+    model, batch = RewardModel(3, 2, False, False, [8], "tanh", 0.9), a_batch(size=64)
+    config = AIRLConfig(gradient_penalty=1.0)
+    found = [
+        discriminator.minibatch_loss(
+            model, batch, None, torch.tensor([0.5, 0.5]), config, 0.0, generator(seed)
+        ).total
+        for seed in (0, 0, 1)
+    ]
+    ends = [
+        discriminator.gradient_penalty(model, batch, torch.full((2, 64, 1), share))
+        for share in (0.0, 1.0)
+    ]
+    plain = replace(config, gradient_penalty=0.0)
+    without = discriminator.minibatch_loss(
+        model, batch, None, torch.tensor([0.5, 0.5]), plain, 0.0, generator(0)
+    ).total
+    assert found[0] == found[1] != found[2]
+    mix = torch.rand(2, 64, 1, generator=generator(0))
+    torch.testing.assert_close(
+        found[0] - without, discriminator.gradient_penalty(model, batch, mix)
+    )
+    assert not any(torch.isclose(found[0] - without, end, rtol=1e-4) for end in ends)
+
+
+def generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
 def test_logits_may_leave_log_pi_out():
     model, batch = RewardModel(3, 2, False, False, [8], "tanh", 0.9), a_batch()
     logits, f = discriminator.discriminator_logits(model, batch, "f")
