@@ -6,7 +6,8 @@ settings, and the mean over all methods, seed by seed, of what retraining earns 
 (t-test). Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
 With ``--pool`` the reports are one: each has other seeds of the same rows, measured with the same
-experts, and learned from the same demonstrations. The latter is not checked: reports do not hold it.
+experts, and learned from the same demonstrations. Reports before stage 42 do not hold the latter, so
+it is checked only among the others.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ def pooled(tables: list[pd.DataFrame]) -> pd.DataFrame:
     """The tables of several reports as one, with the first report's agents that learn nothing.
 
     Raises:
-        ValueError: two tables have the same seed of a method, or other evaluations of an expert.
+        ValueError: two tables have the same seed of a method, other evaluations of an expert, or
+            seeds that learned from other demonstrations.
     """
     everything = pd.concat(tables, ignore_index=True)
     of_methods = everything["agent"].isin([*METHODS])
@@ -71,6 +73,13 @@ def pooled(tables: list[pd.DataFrame]) -> pd.DataFrame:
     experts = others[others["agent"] == "expert"]
     if (experts.groupby(["row", "measure", "setting"])["evaluation"].nunique() > 1).any():
         raise ValueError("the reports have different experts, so their seeds do not compare")
+    if "demonstrations" in learned:
+        for (row, agent), sets in learned.groupby(["row", "agent"])["demonstrations"]:
+            if sets.nunique() > 1:
+                listed = ", ".join(sets.dropna().unique())
+                raise ValueError(
+                    f"{agent} of {row} learned from different demonstrations: {listed}"
+                )
     place = ["row", "agent", "measure", "expert_of", "setting"]
     return pd.concat([others.drop_duplicates(place), learned], ignore_index=True)
 

@@ -36,6 +36,15 @@ def test_a_seed_in_two_reports_is_refused():
         pooled([_seeds([0, 1]), _seeds([1, 2])])
 
 
+def test_reports_of_different_demonstrations_are_refused():
+    one, two = _seeds([0]).assign(demonstrations="d1"), _seeds([1]).assign(demonstrations="d2")
+    with pytest.raises(ValueError, match="erm of ant mass .* demonstrations: d1, d2"):
+        pooled([one, two])
+    # A report of an earlier version does not say what its seeds learned from.
+    for other in (_seeds([1]), two.assign(demonstrations="d1")):
+        assert len(pooled([one, other])) == 5
+
+
 def test_reports_with_different_experts_are_refused():
     with pytest.raises(ValueError, match="different experts"):
         pooled([_seeds([0]), _seeds([1], expert="e2")])

@@ -10,7 +10,7 @@ import pandas as pd
 
 from irlcli.report.agents import IN_DISTRIBUTION, title
 from irlcli.report.compute import Assessments, failed_to_imitate
-from irlcli.report.lineage import is_mixed, lineage, origins, short
+from irlcli.report.lineage import demonstrations, is_mixed, lineage, origins, short
 from irlcli.report.parameters import EXPERT_BY_REWARD, Cell, Code, Parameters, has_held_out
 from irlcli.report.statistics import identical_runs
 from irlcli.report.text import percent
@@ -213,9 +213,7 @@ def shared_demonstrations(p: Parameters) -> list[str]:
     for row in p.rows:
         cells = [c for c in p.cells_of(row.name) if c.seed is not None and c.run]
         seeds = {c.seed for c in cells}
-        behind = lineage(p, cells)
-        sets = [i for i in behind if p.runs[i].stage in ("collect-experts", "import")]
-        if len(sets) == 1 and len(seeds) > 1:
+        if len(demonstrations(p, cells)) == 1 and len(seeds) > 1:
             rows.append(row.name)
     if not rows:
         return []

@@ -18,6 +18,8 @@ Most functions take *points*: a row per evaluation and setting with the columns
                   returns, over episodes from the same start states; known of retrained policies
     episodes      their number
     evaluation    id of the artefact
+    demonstrations
+                  ids of the datasets behind it; empty for experts and baselines
 """
 
 from __future__ import annotations

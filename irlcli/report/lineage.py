@@ -27,6 +27,11 @@ def lineage(p: Parameters, cells: Sequence[Cell]) -> list[str]:
     return list(found)
 
 
+def demonstrations(p: Parameters, cells: Sequence[Cell]) -> list[str]:
+    """The ids of the datasets that the agents of ``cells`` learned from."""
+    return [i for i in lineage(p, cells) if p.runs[i].stage in ("collect-experts", "import")]
+
+
 def origins(p: Parameters, cells: Sequence[Cell]) -> dict[Origin, list[str]]:
     """The runs behind ``cells`` by what they were made with, the largest group first."""
     groups: dict[Origin, list[str]] = {}

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from irlcli.report.lineage import demonstrations
 from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, Parameters
 from irlcli.stages.base import Job, Request, Source, Stage
 from irlcli.store import read_json
@@ -103,6 +104,7 @@ def _points(job: Job) -> list[dict[str, Any]]:
                 "gap_error": errors.get((place.setting, "learned_return")),
                 "episodes": place.episodes,
                 "evaluation": cell.run,
+                "demonstrations": " ".join(demonstrations(job.parameters, [cell])),
             }
             for place in summary.settings
             # In its own setting an expert is what the others are compared with, not a baseline.
@@ -217,4 +219,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 41, run)
+STAGE = Stage("report", 42, run)

@@ -124,6 +124,9 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
                 gaps = theirs[f"{kind}_return"] - own[f"{kind}_return"]
                 error = gaps.std() / len(gaps) ** 0.5
                 assert chosen[column].item() == pytest.approx(error, rel=1e-4)
+    learned = points["agent"].isin(["erm", "irm"])
+    assert set(points.loc[learned, "demonstrations"]) == {store.resolve("demos").artefact.id}
+    assert points.loc[~learned, "demonstrations"].isna().all()
     in_distribution = points[(points["measure"] == "id") & (points["agent"] == "irm")]
     assert sorted(set(in_distribution["setting"])) == ["engine-power=1.25x", "engine-power=1x"]
 

@@ -68,6 +68,7 @@ def example(values, **more):
                         "gap_error": None,
                         "episodes": 20,
                         "evaluation": id16,
+                        "demonstrations": "",
                     }
                 )
     given = {
