@@ -38,7 +38,7 @@ def test_a_seed_in_two_reports_is_refused():
 
 def test_reports_of_different_demonstrations_are_refused():
     one, two = _seeds([0]).assign(demonstrations="d1"), _seeds([1]).assign(demonstrations="d2")
-    with pytest.raises(ValueError, match="erm of ant mass .* demonstrations: d1, d2"):
+    with pytest.raises(ValueError, match=r"erm of ant mass .* demonstrations: d1, d2"):
         pooled([one, two])
     # A report of an earlier version does not say what its seeds learned from.
     for other in (_seeds([1]), two.assign(demonstrations="d1")):

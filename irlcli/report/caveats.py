@@ -10,7 +10,7 @@ import pandas as pd
 
 from irlcli.report.agents import IN_DISTRIBUTION, title
 from irlcli.report.compute import Assessments, failed_to_imitate
-from irlcli.report.lineage import demonstrations, is_mixed, lineage, origins, short
+from irlcli.report.lineage import demonstrations, is_mixed, origins, short
 from irlcli.report.parameters import EXPERT_BY_REWARD, Cell, Code, Parameters, has_held_out
 from irlcli.report.statistics import identical_runs
 from irlcli.report.text import percent
