@@ -269,6 +269,19 @@ def test_each_challenger_starts_from_other_random_weights(demos):
     assert not torch.equal(*first)
 
 
+def test_a_resumed_challenger_goes_on_as_if_it_had_not_stopped(demos):
+    """The second challenger, between its two rounds: its actions are drawn by its own seed."""
+    _, _, whole = challenged(demos)
+    for index in range(3):
+        whole.train_round(index)
+    _, _, resumed = challenged(demos)
+    resumed.load_state_dict(deepcopy(whole.state_dict()))
+    (expected,), (found,) = whole.train_round(3), resumed.train_round(3)
+    for field in ("observations", "actions", "true_rewards", "returns"):
+        np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
+    torch.testing.assert_close(weights_of(resumed), weights_of(whole), rtol=0, atol=0)
+
+
 def test_each_settings_challenger_is_a_policy_of_its_own(demos):
     """The first acts as it would alone; the second starts from other weights, in its own worlds."""
     _, learner, _ = challenged(demos)
@@ -353,6 +366,29 @@ def test_a_challenger_is_paid_the_bounded_reward(demos):
         highest = np.quantile(learner.quantiles, ceiling)
         np.testing.assert_allclose(paid, np.minimum(g, highest), rtol=1e-5)
         assert (paid < g).any()
+
+
+def test_a_challengers_ceiling_is_of_the_current_reward_not_of_a_mean_of_rounds(demos):
+    """At the 0 quantile no step earns more than the least demonstrated one."""
+    trainer, learner, _ = challenged(demos, averaged_rounds=3, fixed_horizon=False)
+    challenger = replace(learner.config.challenger, ceiling=0.0)
+    learner.config = replace(learner.config, challenger=challenger)
+    for index in range(3):
+        (rollout,) = trainer.train_round(index, learner)
+        learner.update(index, [rollout], trainer.policy, [rollout])
+    recorded = join([transitions([t], HORIZON) for group in demos for t in group])
+    acted = rollout.transitions(slice(None), HORIZON)
+    with torch.no_grad():
+        least, g = (
+            learner.model.reward(
+                torch.as_tensor(data.observations),
+                learner.model.encode(torch.as_tensor(data.actions)),
+            ).numpy()
+            for data in (recorded, acted)
+        )
+    paid = learner.challenger_rewards(rollout).ravel()
+    np.testing.assert_allclose(paid, np.minimum(g, least.min()), rtol=1e-5, atol=1e-6)
+    assert learner.quantiles[0] != pytest.approx(float(least.min()), rel=1e-3)
 
 
 def test_a_challengers_absorbing_state_earns_a_series_in_its_own_discount(demos):
@@ -532,8 +568,10 @@ def test_the_deployed_reward_is_the_mean_over_equally_spaced_rounds(demos, tmp_p
     torch.testing.assert_close(model.reward(states, actions), expected)
 
 
-def test_rounds_can_be_averaged_by_the_learning_rate(demos):
-    changes = {"averaged_rounds": 3, "averaged_by": "learning-rate"}
+@pytest.mark.parametrize(("members", "rounds"), [(3, [0, 1, 5]), (6, [0, 0, 0, 1, 2, 5])])
+def test_rounds_can_be_averaged_by_the_learning_rate(demos, members, rounds):
+    """The rates are as 6, 5, 4, 3, 2, 1, in sums 6, 11, 15, 18, 20, 21; members join at multiples of 7 or 3.5."""
+    changes = {"averaged_rounds": members, "averaged_by": "learning-rate"}
     trainer, learner = make(
         demos,
         ppo=LONG,
@@ -548,8 +586,7 @@ def test_rounds_can_be_averaged_by_the_learning_rate(demos):
         learner.update(index, [rollout], trainer.policy)
         after.append(deepcopy(learner.model))
     states, actions = torch.randn(7, 8) * 3, torch.eye(4)[torch.randint(4, (7,))]
-    # The rates are as 6, 5, 4, 3, 2, 1: a third of their sum is 7.
-    expected = sum(after[index].reward(states, actions) for index in (0, 1, 5)) / 3
+    expected = sum(after[index].reward(states, actions) for index in rounds) / members
     torch.testing.assert_close(learner.deployed.reward(states, actions), expected)
 
 

@@ -101,6 +101,33 @@ def test_an_error_in_a_challengers_world_is_named():
     assert warnings[0].startswith(named)
 
 
+def test_a_round_is_scored_after_the_learner_has_learned_from_it():
+    """Otherwise the reward that is kept would be another than the one that scored."""
+    calls = []
+
+    class Learning:
+        def begin(self, trainer):
+            calls.append("begin")
+
+        def update(self, index, rollouts, policy, challenger_rollouts):
+            calls.append(f"update {index}")
+            return [{}, {}]
+
+    class Scoring:
+        def consider(self, index, policy):
+            calls.append(f"score {index}")
+            return {}
+
+        def restore(self, policy):
+            calls.append("restore")
+
+    Training(Counting(), None, ["one", "other"], Learning(), Scoring()).run(
+        lambda *_: None, pytest.fail
+    )
+    rounds = [call for index in range(5) for call in (f"update {index}", f"score {index}")]
+    assert calls == ["begin", *rounds, "restore"]
+
+
 def test_a_resumed_run_remembers_the_best_round():
     """The second of five rounds scores highest; the run is cut after each of them."""
 

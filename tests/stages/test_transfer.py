@@ -24,16 +24,18 @@ from irlcli.stages.base import environment_key
 from irlcli.stages.running import frozen_reward
 from irlcli.store import Store
 
+RELU = ["--set", "airl.ppo.activation=relu"]
+
 
 @pytest.fixture(scope="module")
 def cheetah(tmp_path_factory, run_irl):
-    """A store with a reward ``airl`` of HalfCheetah."""
+    """A store with a reward ``airl`` of HalfCheetah, whose student has other layers than the default."""
     store = tmp_path_factory.mktemp("cheetah") / "runs"
     common = ["--store", str(store), "--profile", "smoke", "--quiet", "--name"]
     intervention = ["--env", "half-cheetah", "--intervention", "friction"]
     for arguments in (
         ["collect-experts", *intervention, *common, "demos"],
-        ["train-airl", "--demos", "demos", "--method", "erm", *common, "airl"],
+        ["train-airl", "--demos", "demos", "--method", "erm", *common, "airl", *RELU],
     ):
         done = run_irl(arguments)
         assert done.code == 0, done.err
@@ -307,6 +309,7 @@ def test_the_restart_with_the_highest_learned_return_is_kept(runs, irl, monkeypa
 
 
 def test_restarts_are_measured_under_the_ceiling(runs, irl, monkeypatch):
+    """On the same episodes, other than those that evaluations measure."""
     seen, original = [], FrozenReward.of_episode
 
     def spied(self, trajectory):
@@ -325,6 +328,11 @@ def test_restarts_are_measured_under_the_ceiling(runs, irl, monkeypatch):
     )
     assert about["restarts"] == pytest.approx(np.reshape(bounded, (2, -1)).mean(1))
     assert (np.array(unbounded) > bounded).all()
+    first, second = np.reshape([trajectory.seed for trajectory in seen], (2, -1)).tolist()
+    assert first == second
+    (setting,) = (parse_setting("half-cheetah", text) for text in about["settings"])
+    evaluated = roll_out("half-cheetah", setting, "idle", len(first), 0, "evaluate")
+    assert {t.seed for t in evaluated}.isdisjoint(first)
 
 
 def test_one_restart_is_the_policy_without(runs, irl):

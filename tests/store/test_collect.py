@@ -88,6 +88,28 @@ def test_names_and_their_ancestors_are_kept(empty_store, family, named, kept):
     assert list((empty_store.root / ".work").iterdir()) == []
 
 
+def test_what_the_manifest_of_a_newer_version_mentions_is_kept(empty_store, family):
+    """Its form is unknown, so whatever content it names is kept, with its ancestors."""
+    directory = family["lonely"].directory
+    directory.chmod(0o755)
+    mentioned = family["demos"].manifest.content
+    (directory / "manifest.json").unlink()
+    (directory / "manifest.json").write_text(f'{{"schema": 99, "from": ["{mentioned}"]}}')
+    removed, _ = empty_store.collect(0.0)
+    assert ids(*removed) == ids(family["airl"], family["moved"])
+    assert directory.is_dir()
+
+
+def test_the_keys_of_what_is_removed_are_free_again(empty_store, family):
+    keys = empty_store.root / ".keys"
+    before = {path.name for path in keys.iterdir()}
+    empty_store.set_name("kept", family["demos"])
+    removed, _ = empty_store.collect(0.0)
+    gone = {artefact.manifest.record.key for artefact in removed}
+    assert len(gone) == 3
+    assert {path.name for path in keys.iterdir()} == before - gone
+
+
 def test_grace_period(empty_store, family):
     age(family["lonely"].directory, 0)
     age(family["moved"].directory, 2)

@@ -102,6 +102,38 @@ def test_a_lease_is_kept_alive(empty_store, leases, monkeypatch):
         assert lease.read(path).lives(locks_work=False)
 
 
+def test_the_clock_of_a_machine_does_not_matter(empty_store, leases, monkeypatch):
+    path = foreign(leases / f"{KEY}.claim")
+    ahead = time.time() + 10 * lease.STALE_SECONDS
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "time", lambda: ahead)
+        assert lease.read(path).lives(locks_work=True)
+
+
+def test_whoever_lost_a_lease_does_not_keep_the_new_one_alive(empty_store, leases, monkeypatch):
+    monkeypatch.setattr(lease, "HEARTBEAT_SECONDS", 0.01)
+    with empty_store.working_on(KEY, wait=False):
+        path = foreign(leases / f"{KEY}.claim", 1000.0)
+        before = path.stat().st_mtime
+        time.sleep(0.3)
+        assert path.stat().st_mtime == before
+
+
+def test_a_reader_is_seen_before_it_looks_for_gc(empty_store, leases, monkeypatch):
+    """gc does the same the other way round, so that one of the two sees the other."""
+    seen, original = [], lease.read
+
+    def read(path):
+        if path.name == "gc.claim":
+            seen.append(len(list(leases.glob(".reader.*"))))
+        return original(path)
+
+    monkeypatch.setattr(lease, "read", read)
+    with empty_store.in_use():
+        pass
+    assert seen == [1]
+
+
 @pytest.mark.parametrize(
     "text", ["[" * 1000, '{"host": "a", "machine": "b", "process": 1e999, "token": "c"}', "7", ""]
 )
