@@ -336,6 +336,34 @@ def test_a_bad_setting_of_several_knobs_is_refused(text, message):
     assert caught.value.hint
 
 
+def test_two_knobs_of_one_argument_are_refused_in_one_setting(monkeypatch):
+    knobs = {**_FORMS, "twin": _FORMS["plain"]}
+    spec = EnvironmentSpec(WORLD, "", "test/World-v0", 10, knobs)
+    monkeypatch.setitem(ENVIRONMENTS, WORLD, spec)
+    with pytest.raises(UsageError, match="sets plain twice, by plain and twin"):
+        parse_setting(WORLD, "plain=1,twin=2")
+
+
+def test_a_setting_of_many_knobs_has_a_bound(monkeypatch):
+    """It is a column of datasets and a part of names."""
+    knobs = {f"knob-{i}": Knob(f"k{i}", ("absolute",), 0.0, 1.0, "") for i in range(60)}
+    spec = EnvironmentSpec(WORLD, "", "test/World-v0", 10, knobs)
+    monkeypatch.setitem(ENVIRONMENTS, WORLD, spec)
+    few, many = (",".join(f"{knob}=0.5" for knob in [*knobs][:n]) for n in (30, 60))
+    assert str(parse_setting(WORLD, few)).count("=") == 30
+    with pytest.raises(UsageError, match="more than 400 characters"):
+        parse_setting(WORLD, many)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_whole_number_reaches_the_environment_as_an_int(monkeypatch, whole):
+    knobs = {"layout": Knob("layout", ("absolute",), 0.0, 9.0, "a layout", whole=whole)}
+    spec = EnvironmentSpec(WORLD, "", "test/World-v0", 10, knobs)
+    monkeypatch.setitem(ENVIRONMENTS, WORLD, spec)
+    (found,) = env_kwargs(WORLD, parse_setting(WORLD, "layout=3")).values()
+    assert found == 3 and isinstance(found, int) == whole
+
+
 @pytest.mark.parametrize("env", ["ant", "half-cheetah"])
 def test_two_goals_in_one_setting_are_refused(env):
     with pytest.raises(UsageError, match="adds a goal twice, by direction and goal-y"):
@@ -469,6 +497,12 @@ def test_a_goal_or_cue_that_the_policy_cannot_see_is_refused(trained, wanted, fi
         check_observed("half-cheetah", [trained], places)
     alike = {"goal-y=0": "goal-y or direction", "cue-strength=0.8": "cue-strength"}
     assert caught.value.hint.endswith(alike.get(trained, "mass or friction or leg-length"))
+
+
+def test_every_setting_must_have_the_observations_that_were_learned():
+    places = [parse_setting("half-cheetah", text) for text in ("mass=2x", "goal-y=0")]
+    with pytest.raises(UsageError, match="goal-y=0 and default have different observations"):
+        check_observed("half-cheetah", ["default"], places)
 
 
 def test_the_hint_names_all_that_must_be_observed():

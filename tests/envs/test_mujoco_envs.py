@@ -187,7 +187,7 @@ def test_an_unstable_simulation_ends_the_episode_and_leaves_no_trace(
 def test_a_robot_that_is_thrown_apart_earns_nothing_for_it(name):
     """MuJoCo's own bound is 1e10; below it the speed forward would still be paid."""
     env = ROBOTS[name]()
-    for speed, thrown in ((20.0, False), (1000.0, True)):
+    for speed, thrown in ((20.0, False), (1000.0, True), (-1000.0, True)):
         env.reset(seed=0)
         env.data.qvel[0] = speed
         _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))

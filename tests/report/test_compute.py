@@ -233,6 +233,22 @@ def test_every_retrained_policy_of_a_reward_is_judged():
     assert (found.seeds, found.judged, found.short) == (3, 6, 3)
 
 
+def test_seeds_count_equally_however_often_each_was_retrained():
+    """Seed 0 has three policies in its training setting, the other seeds have one."""
+    values = complete() | {(BOUNCE, "erm", EXPERT_BY_REWARD): [280.0] * 3}
+    values[BOUNCE, "erm", "transfer-id"] = [125.0, 250.0, 250.0]
+    p, points = example(values, measures=("transfer", "transfer-id", "id"))
+    mine = (points["row"] == BOUNCE) & (points["agent"] == "erm")
+    first = points[mine & (points["seed"] == 0) & points["measure"].str.startswith("transfer")]
+    points["learned_return"] = (points["measure"] == "transfer") * points["seed"].fillna(0.0)
+    again = [first.assign(retraining=n, learned_return=0.0) for n in (1, 2)]
+    report = build(p, pd.concat([points, *again], ignore_index=True), {}, {})
+    found = next(r for r in report.learned_returns.itertuples() if r.row == BOUNCE)
+    assert (found.judged, found.retrained) == (5, pytest.approx((0 + 1 + 2) / 3))
+    share = cell(report, BOUNCE, "erm", "transfer-id")["of_expert"]
+    assert share == pytest.approx((125 + 250 + 250) / 3 / 250)
+
+
 def test_learned_returns_need_both_evaluations_of_a_seed():
     values = complete()
     values[BOUNCE, "erm", EXPERT_BY_REWARD] = [250.0, None, 250.0]
