@@ -139,7 +139,7 @@ def test_a_reward_may_be_right_about_good_policies_and_wrong_about_bad_ones():
 def test_the_interval_of_the_lower_half_is_over_the_lower_half_of_each_resample():
     """All of ten bad policies are ranked the wrong way round, all of ten good ones above them."""
     true = [*range(10), *range(1000, 1010)]
-    learned = [-x for x in range(10)] + [x for x in range(100, 110)]
+    learned = [*range(0, -10, -1), *range(100, 110)]
     assert agreement(bank(true, learned)).spearman.low > 0.0
     found = agreement(bank(true, learned), lower=True).spearman
     assert found.value == -1.0 and found.low == pytest.approx(-1.0)
