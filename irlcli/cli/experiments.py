@@ -16,7 +16,14 @@ from irlcli.cli.options import Out, planning_command, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.cli.table_report import check_out, copy_outputs, print_report, report_of
 from irlcli.errors import Interrupted, IrlError, NotFound, StageFailed, UsageError
-from irlcli.requests.tables import TableChoice, check_tag, open_plan, steps_of, warn_of_damage
+from irlcli.requests.tables import (
+    TableChoice,
+    check_tag,
+    check_worlds,
+    open_plan,
+    steps_of,
+    warn_of_damage,
+)
 
 if TYPE_CHECKING:
     from irlcli.experiments.execute import Outcome
@@ -256,6 +263,7 @@ def run(
                 )
             _make_one(session, runner, plan, only)
             return
+        check_worlds(plan)
         warn_of_damage(plan, session.console.warn)
         command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
         if cluster is None:

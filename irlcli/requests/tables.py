@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from irlcli.configs.documents import read_toml
 from irlcli.configs.load import in_profile
+from irlcli.envs.spaces import check_spaces
 from irlcli.errors import IntegrityError, UsageError, suggest
+from irlcli.interventions import listed_settings
 from irlcli.methods import METHODS
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession, check_path
@@ -154,6 +156,17 @@ def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] 
     for name in (*plan.tasks, choice.report_name(tag)):
         session.store.check_name(name)
     return plan
+
+
+def check_worlds(plan: "Plan") -> None:
+    """Refuse rows whose settings have different spaces: experts may be trained for hours first.
+
+    Raises:
+        UsageError: see :func:`irlcli.envs.spaces.check_spaces`.
+    """
+    for row in plan.table.rows if plan.table.kind == "comparison" else ():
+        listed = plan.config(row.env).interventions[row.knob]
+        check_spaces(row.env, listed_settings(row.env, row.knob, [*listed.id, *listed.ood]))
 
 
 def _candidates(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium
@@ -436,6 +437,15 @@ FORCES = "self.action_space = gymnasium.spaces.Box(-mass_scale, mass_scale, (1,)
 LONGER = (
     "self.observation_space = gymnasium.spaces.Box(-10.0, 10.0, (int(mass_scale),), np.float32)"
 )
+# Trains in 1x and 2x, and transfers to 4x.
+TABLE = """
+[cart]
+title = "The cart"
+rows = ["cart.toml.mass"]
+methods = ["erm"]
+seeds = [0]
+measures = ["transfer"]
+"""
 ENTRIES = "return np.full(self.observation_space.shape, self.position / 10, np.float32)"
 
 
@@ -461,6 +471,11 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
     assert done.code == 2 and named in error and hint.startswith("hint: "), done.err
     # Before the expert of 3x is trained.
     assert "3x" not in bench.irl("ls", "--stage", "train-expert").out
+    Path("tables.toml").write_text(TABLE)
+    table = bench.irl("run", "cart", "--experiments", "tables.toml", "--profile", "smoke")
+    kind = "numbers in an observation" if observed else "has actions in"
+    assert table.code == 2 and kind in table.err and "with mass=1x" in table.err, table.err
+    assert "1x" not in bench.irl("ls", "--stage", "train-expert").out
     checked = bench.irl("envs", "check", "cart.toml")
     assert (
         checked.code == 1 and ("has actions in" if not observed else "numbers in an") in checked.out
