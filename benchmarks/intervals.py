@@ -3,7 +3,7 @@
 For reports that were written before these columns existed. Also the share of each training setting's
 expert that the students earn in the mean over seeds, what the training experts earn in each other's
 settings, and the mean over all methods, seed by seed, of what retraining earns above the student
-(t-test). Run with
+(t-test). In the rows of the paper's Table 1, the paper's difference beside ours. Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
 With ``--pool`` the reports are one: each has other seeds of the same rows, measured with the same
 experts, and learned from the same demonstrations. Reports before stage 42 do not hold the latter, so
@@ -13,11 +13,14 @@ it is checked only among the others.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from scipy import stats
 
 from irlcli.methods import METHODS
+from irlcli.report.paper import SEEDS, TABLE1
 from irlcli.report.parameters import EXPERT_BY_REWARD
 from irlcli.report.statistics import compare, paired_p
 
@@ -44,6 +47,8 @@ def main(reports: list[Path], pool: bool) -> None:
                         f"{name}: {row}, {measure}: {means}, IRM - ERM {found.difference:.1f} "
                         f"[{low:.1f}, {high:.1f}], detectable {found.detectable:.1f}, p {found.welch:.3f}"
                     )
+                    if measure == "transfer":
+                        _print_paper(name, row, by_seed)
         _print_imitation(name, seeds)
         _print_reused(name, seeds)
         for row, points in learned.groupby("row", sort=False):
@@ -82,6 +87,40 @@ def pooled(tables: list[pd.DataFrame]) -> pd.DataFrame:
                 )
     place = ["row", "agent", "measure", "expert_of", "setting"]
     return pd.concat([others.drop_duplicates(place), learned], ignore_index=True)
+
+
+def contrast(
+    groups: Sequence[tuple[float, float, float, int]],
+) -> tuple[float, float, float, float]:
+    """A signed sum of independent means, its 95 % interval and its two-sided p (Welch-Satterthwaite).
+
+    ``groups`` are sign, mean, standard deviation and n; n is 2 or more.
+    """
+    value = sum(sign * mean for sign, mean, _, _ in groups)
+    variances = [(deviation**2 / n, n) for _, _, deviation, n in groups]
+    total = sum(v for v, _ in variances)
+    freedom = total**2 / sum(v**2 / (n - 1) for v, n in variances)
+    half = float(stats.t.isf(0.025, freedom)) * total**0.5
+    p = 2.0 * float(stats.t.sf(abs(value) / total**0.5, freedom))
+    return value, value - half, value + half, p
+
+
+def _print_paper(name: str, row: str, by_seed: pd.Series) -> None:
+    env, knob = row.split()
+    printed = TABLE1.get((env, knob))
+    if printed is None:
+        return
+    theirs = [(1, *printed.irm, SEEDS), (-1, *printed.erm, SEEDS)]
+    ours = [
+        (sign, by_seed[method].mean(), by_seed[method].std(), len(by_seed[method]))
+        for sign, method in ((-1, "irm"), (1, "erm"))
+    ]
+    gap, low, high, _ = contrast(theirs)
+    more, least, most, p = contrast([*theirs, *ours])
+    print(
+        f"{name}: {row}, the paper's IRM - ERM {gap:.1f} [{low:.1f}, {high:.1f}], above ours by "
+        f"{more:.1f} [{least:.1f}, {most:.1f}], p {p:.3f}"
+    )
 
 
 def _print_imitation(name: str, seeds: pd.DataFrame) -> None:

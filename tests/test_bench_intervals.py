@@ -1,9 +1,11 @@
 """``benchmarks.intervals`` pools the seeds of several published reports."""
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.intervals import main, pooled
+from benchmarks.intervals import contrast, main, pooled
+from irlcli.report.statistics import compare
 
 
 def _seeds(numbers, expert="e1", returns=100.0):
@@ -29,6 +31,19 @@ def test_pooled_reports_equal_one_report_of_all_seeds(tmp_path, capsys):
     main([tmp_path / "all"], pool=False)
     assert together.replace("one + two", "all") == capsys.readouterr().out
     assert "ERM 101.0 ± 1.0 (3 seeds), IRM 103.0 ± 3.0 (3 seeds), IRM - ERM 2.0" in together
+
+
+def test_the_contrast_of_two_means_is_welchs_test():
+    x, y = [3.0, 5.0, 10.0], [1.0, 2.0, 4.0, 4.5]
+    groups = [(s, np.mean(v), np.std(v, ddof=1), len(v)) for s, v in ((1, x), (-1, y))]
+    found = compare(x, y)
+    assert contrast(groups) == pytest.approx((found.difference, *found.interval, found.welch))
+
+
+def test_the_papers_difference_stands_beside_ours(tmp_path, capsys):
+    _seeds([0, 1, 2]).assign(row="ant friction").to_csv(tmp_path / "seeds.csv", index=False)
+    main([tmp_path], pool=False)
+    assert "the paper's IRM - ERM 241.2 [" in capsys.readouterr().out
 
 
 def test_a_seed_in_two_reports_is_refused():

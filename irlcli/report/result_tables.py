@@ -69,7 +69,7 @@ _QUALITY_NOTE = (
     "over seeds. The next three count the policies retrained from scratch by verdict: matches the expert, if the "
     "regret is within 10 % of what the expert earns above the random agent; else wrong reward, if the "
     "policy's learned return is at least the expert's; else optimisation fell short. Uncertain: verdicts on "
-    "differences within two standard errors."
+    "differences within two standard errors, or whose plain and discounted gaps have opposite signs."
 )
 _COMPARISON_NOTE = (
     "Difference of the means, with its 95 % interval by Welch's test. Detectable: the difference that "
