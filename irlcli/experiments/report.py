@@ -174,9 +174,23 @@ def _rows(plan: Plan, choices: Mapping[_Run, tuple[float, Artefact]]) -> list[Ro
                 demonstrations=demos.parameters.episodes,
                 config=msgspec.to_builtins(configs),
                 chosen=_weights(plan, f"{row.env} {row.knob}", choices),
+                student_share=_student_shares(plan, f"{row.env} {row.knob}"),
             )
         )
     return rows
+
+
+def _student_shares(plan: Plan, row: str) -> dict[str, float]:
+    """See :attr:`Row.student_share`."""
+    found = {}
+    for task in plan.cells:
+        assert task.cell is not None
+        learned = task.curves.get("reward-learning")
+        if task.cell.row == row and learned is not None:
+            challenger = learned.parameters.airl.challenger
+            if challenger.life > 0:
+                found[task.cell.agent] = 1.0 - challenger.share
+    return found
 
 
 def _choices(plan: Plan) -> dict[_Run, tuple[float, Artefact]]:

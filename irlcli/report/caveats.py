@@ -172,7 +172,7 @@ def saturated(ends: pd.DataFrame) -> list[str]:
     return [
         f"Saturated: {r.row}, {title(r.agent)}: at the end of training the discriminator classifies "
         f"{r.accuracy:.1%} of the round's samples correctly, and lambda times the optimised penalty is "
-        f"{percent(r.share)} of the optimised cross-entropy. The penalty has little left to change."
+        f"{percent(r.share)} of the optimised cross-entropy, as weighted in the loss. The penalty has little left to change."
         for r in ends.itertuples()
         if r.penalty_weight > 0 and r.accuracy >= SATURATED
     ]

@@ -367,8 +367,9 @@ def discriminator_ends(p: Parameters, learning: Learning) -> pd.DataFrame:
     """The discriminator over the last tenth of the rounds, a row per row and method.
 
     Columns: ``row``, ``agent``, ``seeds``; means over settings and seeds of the metrics of
-    ``train-airl``; ``share``, lambda times the optimised penalty over the optimised cross-entropy,
-    None if that is zero. ``cross_entropy`` and ``penalty`` are of the round's samples, the optimised ones
+    ``train-airl``; ``share``, lambda times the optimised penalty over the optimised cross-entropy
+    times its weight in the loss (:attr:`irlcli.report.parameters.Row.student_share`), None if that is
+    zero. ``cross_entropy`` and ``penalty`` are of the round's samples, the optimised ones
     of the minibatches that were minimised.
     """
     found = []
@@ -384,6 +385,7 @@ def discriminator_ends(p: Parameters, learning: Learning) -> pd.DataFrame:
                 ends.append(end[list(_DIAGNOSTICS)].assign(weighted=weighted).mean())
             means = pd.concat(ends, axis=1).mean(axis=1)
             weighted, entropy = means.pop("weighted"), means["optimised_cross_entropy"]
+            entropy *= row.student_share.get(method, 1.0)
             share = weighted / entropy if entropy > 0 else None
             values = {"row": row.name, "agent": method, "seeds": len(runs), "share": share}
             found.append(values | means.to_dict())

@@ -90,6 +90,8 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
         config: the configs of the row's stages, by stage, as JSON values.
         chosen: lambda by ``METHOD SEED``, where it was chosen by leaving a setting out, and by
             ``METHOD``, where the table says it.
+        student_share: the weight of the student's cross-entropy in the discriminator's loss, by method
+            or variant; missing without challengers, where it is 1.
     """
 
     env: str
@@ -99,6 +101,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     demonstrations: tuple[int, ...]
     config: dict[str, Any]
     chosen: dict[str, float] = {}
+    student_share: dict[str, float] = {}
 
     @property
     def name(self) -> str:

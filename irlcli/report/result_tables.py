@@ -90,7 +90,8 @@ _DISCRIMINATOR_NOTE = (
     "is IRMv1, also for methods that do not penalise it. Optimised: means over the update's minibatches, "
     "which hold replayed episodes; challengers and the gradient penalty are not included. With symmetries they are random "
     "images; the samples of *this round* are as recorded. Share: lambda times "
-    "the optimised penalty over the optimised cross-entropy. The unbiased estimate of the penalty "
+    "the optimised penalty over the optimised cross-entropy times its weight in the loss, which challengers reduce by "
+    "airl.challenger.share. The unbiased estimate of the penalty "
     "may be negative. Where --select kept an earlier round, or rounds were averaged, these are still the "
     "last rounds. If the discriminator is always right, the penalty has nothing to change."
 )

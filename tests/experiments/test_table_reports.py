@@ -139,6 +139,17 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
     assert cells.loc[("lunar-lander bounce", "erm", "transfer"), "seeds"] == 0
 
 
+@pytest.mark.parametrize(("life", "shares"), [(0, {}), (1, {"erm": 0.25, "irm": 0.25})])
+def test_challengers_take_their_share_of_the_loss(report, table_store, life, shares):
+    changes = ["airl.logit=f", f"airl.challenger.life={life}", "airl.challenger.share=0.75"]
+    changes = [word for change in changes for word in ("--set", change)]
+    done = report("table1", table_store, *ROW, *changes)
+    assert done.code == 0, done.err
+    made = Store(table_store).resolve(Path(done.out.strip()).name).artefact
+    rows = made.manifest.record.parameters["rows"]
+    assert [row["student_share"] for row in rows if row["knob"] == "engine-power"] == [shares]
+
+
 def test_learned_returns_are_those_of_the_evaluations(report, table_store):
     directory = Path(report("table1", table_store, *ROW).out.strip())
     store = Store(table_store)

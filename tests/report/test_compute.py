@@ -276,6 +276,17 @@ def test_the_penaltys_share_is_of_what_was_optimised():
     assert (found.loc["erm", "share"], found.loc["irm", "seeds"]) == (0.0, 2)
 
 
+def test_the_penaltys_share_is_of_the_students_part_of_the_loss():
+    """Challengers have nine tenths of it in the first method's loss."""
+    rows = [msgspec.structs.replace(row, student_share={"irm": 0.1}) for row in ROWS]
+    learning = {(BOUNCE, method, 0): metrics(0.9, 0.001, 8.0) for method in ("irm", "vrex")}
+    p, points = example(complete(), rows=tuple(rows), methods=("irm", "vrex"))
+    found = build(p, points, {}, learning).discriminators.set_index("agent")
+    assert found.loc["irm", "share"] == pytest.approx(0.4)
+    assert found.loc["vrex", "share"] == pytest.approx(0.04)
+    assert found["optimised_cross_entropy"].tolist() == pytest.approx([0.2, 0.2])
+
+
 def test_a_share_of_a_zero_cross_entropy_is_missing():
     certain = metrics(1.0, -0.0001, 4.0).assign(optimised_cross_entropy=0.0)
     report = build(*example(complete()), {}, {(BOUNCE, "irm", 0): certain})
