@@ -359,7 +359,7 @@ def test_a_step_whose_settings_changed_since_the_plan_is_not_made(runs, tmp_path
     store, settings = tmp_path / "runs", tmp_path / "my.toml"
     settings.write_text("[evaluation]\nepisodes = 3\n")
     line = ("--settings", settings, "--tag", "a", "--until", "returns", *more)
-    process = runs.start(store, *line, IRL_TEST_ROUND="1")
+    process = runs.start(store, *line, IRL_TEST_ROUND="0.2")
     runs.wait_for(lambda line: "computes" in line, process)
     settings.write_text("[evaluation]\nepisodes = 77\n")
     _, errors = process.communicate(timeout=600)

@@ -140,12 +140,13 @@ def test_the_report_says_what_the_evaluations_say(report, table_store):
 
 
 @pytest.mark.parametrize(("life", "shares"), [(0, {}), (1, {"erm": 0.25, "irm": 0.25})])
-def test_challengers_take_their_share_of_the_loss(report, table_store, life, shares):
+def test_challengers_take_their_share_of_the_loss(report, table_store, tmp_path, life, shares):
+    store = shutil.copytree(table_store, tmp_path / "runs", symlinks=True)
     changes = ["airl.logit=f", f"airl.challenger.life={life}", "airl.challenger.share=0.75"]
     changes = [word for change in changes for word in ("--set", change)]
-    done = report("table1", table_store, *ROW, *changes)
+    done = report("table1", store, *ROW, *changes)
     assert done.code == 0, done.err
-    made = Store(table_store).resolve(Path(done.out.strip()).name).artefact
+    made = Store(store).resolve(Path(done.out.strip()).name).artefact
     rows = made.manifest.record.parameters["rows"]
     assert [row["student_share"] for row in rows if row["knob"] == "engine-power"] == [shares]
 
