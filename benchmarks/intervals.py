@@ -65,9 +65,12 @@ def pooled(tables: list[pd.DataFrame]) -> pd.DataFrame:
     """The tables of several reports as one, with the first report's agents that learn nothing.
 
     Raises:
-        ValueError: two tables have the same seed of a method, other evaluations of an expert, or
-            seeds that learned from other demonstrations.
+        ValueError: two tables have the same seed of a method, other rows, other evaluations of an
+            expert, or seeds that learned from other demonstrations.
     """
+    rows = {tuple(table["row"].unique()) for table in tables}
+    if len(rows) > 1:
+        raise ValueError(f"the reports have different rows: {sorted(rows)}")
     everything = pd.concat(tables, ignore_index=True)
     of_methods = everything["agent"].isin([*METHODS])
     learned, others = everything[of_methods], everything[~of_methods]
@@ -156,4 +159,7 @@ if __name__ == "__main__":
     parser.add_argument("report", nargs="+", type=Path, help="directory with a seeds.csv")
     parser.add_argument("--pool", action="store_true", help="the reports have other seeds each")
     arguments = parser.parse_args()
-    main(arguments.report, arguments.pool)
+    try:
+        main(arguments.report, arguments.pool)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))

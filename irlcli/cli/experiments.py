@@ -246,6 +246,8 @@ def run(
     check_tag(session, choice, plan.table)
     if directory is not None:
         check_out(directory, session.store.root, plan.table)
+    if only is None and not (status or cancel):
+        check_worlds(plan)
     if session.dry_run:
         _print_plan(session, choice, plan)
         return
@@ -263,7 +265,6 @@ def run(
                 )
             _make_one(session, runner, plan, only)
             return
-        check_worlds(plan)
         warn_of_damage(plan, session.console.warn)
         command = _expecting(plan, _step_command(session, choice, plan, *_PROCESS))
         if cluster is None:

@@ -472,9 +472,11 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
     # Before the expert of 3x is trained.
     assert "3x" not in bench.irl("ls", "--stage", "train-expert").out
     Path("tables.toml").write_text(TABLE)
-    table = bench.irl("run", "cart", "--experiments", "tables.toml", "--profile", "smoke")
     kind = "numbers in an observation" if observed else "has actions in"
-    assert table.code == 2 and kind in table.err and "with mass=1x" in table.err, table.err
+    for more in ([], ["--dry-run"]):
+        line = ["run", "cart", "--experiments", "tables.toml", "--profile", "smoke", *more]
+        table = bench.irl(*line)
+        assert table.code == 2 and kind in table.err and "with mass=1x" in table.err, table.err
     assert "1x" not in bench.irl("ls", "--stage", "train-expert").out
     checked = bench.irl("envs", "check", "cart.toml")
     assert (
