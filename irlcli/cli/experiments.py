@@ -102,6 +102,8 @@ def plan(
     choice = TableChoice(table, seeds, methods, rows, choose_penalty, until, only, tag, experiments)
     plan = open_plan(session, choice)
     check_tag(session, choice, plan.table)
+    if only is None:
+        check_worlds(plan)
     if to is None:
         _print_plan(session, choice, plan)
         return

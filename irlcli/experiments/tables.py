@@ -185,7 +185,8 @@ def load_table(name: str, path: Path | None = None, others: Iterable[str] = ()) 
     if name in REPORTS:
         raise UsageError(f"{name} has no steps", f"`irl report {name}` prints it")
     if name not in tables:
-        raise UsageError(f"unknown table {name!r}", suggest(name, [*others, *tables]))
+        own = "" if path is not None else "; `--experiments FILE` reads tables of your own"
+        raise UsageError(f"unknown table {name!r}", suggest(name, [*others, *tables]) + own)
     table = tables[name]
     if table.kind == "experts":
         return msgspec.structs.replace(table, rows=_rows_of(*ENVIRONMENTS.values()))

@@ -473,8 +473,8 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
     assert "3x" not in bench.irl("ls", "--stage", "train-expert").out
     Path("tables.toml").write_text(TABLE)
     kind = "numbers in an observation" if observed else "has actions in"
-    for more in ([], ["--dry-run"]):
-        line = ["run", "cart", "--experiments", "tables.toml", "--profile", "smoke", *more]
+    for command in (["run"], ["run", "--dry-run"], ["plan"]):
+        line = [*command, "cart", "--experiments", "tables.toml", "--profile", "smoke"]
         table = bench.irl(*line)
         assert table.code == 2 and kind in table.err and "with mass=1x" in table.err, table.err
     assert "1x" not in bench.irl("ls", "--stage", "train-expert").out
