@@ -61,8 +61,9 @@ $(READY): pyproject.toml constraints.txt
 	touch $@
 
 # On two cores: a third worker is at work while other tests wait.
+# A file's tests share a worker, so that their fixtures are made once.
 test: $(READY)
-	$(VENV)/bin/python -m pytest -n 3
+	$(VENV)/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test-cluster: $(READY)
 	command -v slurmctld > /dev/null && command -v sshfs > /dev/null || \

@@ -101,10 +101,11 @@ def run_main(arguments: list[str]) -> Result:
 
 
 def pytest_collection_modifyitems(items):
-    """The longest tests come first: at the end of a parallel run no worker waits for another."""
+    """The longest files come first: at the end of a parallel run no worker waits for another."""
 
     def kind(item):
-        return "torture" not in item.path.parts, not item.path.stem.endswith("_chain")
+        long = {"torture", "experiments"} & set(item.path.parts)
+        return not long, not item.path.stem.endswith("_chain")
 
     items.sort(key=kind)
 

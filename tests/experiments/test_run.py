@@ -369,7 +369,9 @@ def test_a_step_whose_settings_changed_since_the_plan_is_not_made(runs, tmp_path
     # The artefact's own command makes it whatever has changed.
     stored = Store(store).index().artefacts.values()
     assert not any("--expect" in artefact.provenance()["command"] for artefact in stored)
-    runs.run(store, *line[:2], "--tag", "b", *line[4:])
+    plan = runs.start(store, *line[:2], "--tag", "b", "--dry-run")
+    planned, errors = plan.communicate()
+    assert plan.returncode == 0 and "b.lunar-lander.engine-power.erm.0" in planned, errors
 
 
 def alive(pids):
