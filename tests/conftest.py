@@ -194,10 +194,12 @@ def publish_files(
     parameters: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
     places: Mapping[str, str] | None = None,
+    environment: Mapping[str, Any] | None = None,
 ) -> Published:
     """Publish ``files`` as a stage would, without the cost of running one.
 
-    ``inputs`` are contents by role, ``places`` says where they were read.
+    ``inputs`` are contents by role, ``places`` says where they were read, ``environment`` describes
+    one from outside the package.
     """
     record = KeyRecord(stage, 1, dict(parameters or {"seed": 0}), dict(inputs or {}))
     store.create()
@@ -206,7 +208,9 @@ def publish_files(
         for name, data in files.items():
             (output / name).parent.mkdir(parents=True, exist_ok=True)
             (output / name).write_bytes(data)
-        origin = {"command": ["irl", stage], "inputs": dict(places or {})}
+        origin: dict[str, Any] = {"command": ["irl", stage], "inputs": dict(places or {})}
+        if environment is not None:
+            origin["environment"] = dict(environment)
         return store.publish(record, output, origin)
 
 

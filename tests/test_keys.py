@@ -23,7 +23,7 @@ from irlcli.configs import Config, InterventionConfig, load_config
 from irlcli.configs.relevance import relevant_airl, relevant_maxent
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.experiments.bank import Member, Policies, bank
+from irlcli.experiments.bank import Policies, bank
 from irlcli.interventions import parse_settings
 from irlcli.learners import LEARNERS
 from irlcli.penalties import PENALTIES
@@ -173,7 +173,9 @@ def assessed(config: Config, seed: int = 0) -> Request:
         reused={str(SETTINGS[0]): From(expert(config), "policy.pt")},
         experts={},
         retrained={
-            str(UNSEEN): [Member("retrained", "retrained", From(retrained(config), "policy.pt"))]
+            assess.Entry(policy="retrained", kind="retrained", setting=str(UNSEEN)): From(
+                retrained(config), "policy.pt"
+            )
         },
     )
     reward = From(airl(config), "reward.pt")

@@ -6,12 +6,12 @@ from msgspec import Meta
 
 # Bounded, so that every count fits 64 bits and no key holds an infinity or NaN.
 MAX_COUNT = 2**53
-_MAX_FLOAT = 1e300
+MAX_FLOAT = 1e300
 Count = Annotated[int, Meta(ge=1, le=MAX_COUNT)]
 NonNegativeCount = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
-Positive = Annotated[float, Meta(gt=0, le=_MAX_FLOAT)]
-NonNegative = Annotated[float, Meta(ge=0, le=_MAX_FLOAT)]
-Finite = Annotated[float, Meta(ge=-_MAX_FLOAT, le=_MAX_FLOAT)]
+Positive = Annotated[float, Meta(gt=0, le=MAX_FLOAT)]
+NonNegative = Annotated[float, Meta(ge=0, le=MAX_FLOAT)]
+Finite = Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 # Below 1, so that something is left.
 Dropout = Annotated[float, Meta(ge=0, lt=1)]

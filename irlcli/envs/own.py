@@ -18,7 +18,8 @@ import msgspec
 from msgspec import Meta, Struct
 
 from irlcli.configs.documents import converted, read_toml
-from irlcli.configs.load import check_profile
+from irlcli.configs.fields import MAX_FLOAT, Finite
+from irlcli.configs.load import CONTROL, check_profile
 from irlcli.configs.schema import Config
 from irlcli.envs.code import code_of
 from irlcli.envs.registry import ENVIRONMENTS
@@ -26,17 +27,13 @@ from irlcli.envs.spec import Code, EnvironmentSpec, Form, Knob, Own
 from irlcli.errors import NotFound, UsageError, suggest
 
 _NAME = r"[A-Za-z][A-Za-z0-9_-]{0,39}"
-# settings/control.toml is read under this name.
-_RESERVED = "control"
 _MODULE = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
-_MAX_NUMBER = 1e300
 # Version of how such environments are stepped (irlcli.envs.adapted, irlcli.rl.rollout); part of
 # every key.
 _PHYSICS = 3
 _EXAMPLES = "docs/own-environments.md"
 # The column ``t`` of demonstrations is int32.
 _Steps = Annotated[int, Meta(ge=1, le=2**31 - 1)]
-_Number = Annotated[float, Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
 
 class _Env(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -57,8 +54,8 @@ class _Knob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
 
     argument: str
     forms: Annotated[tuple[str, ...], Meta(min_length=1)]
-    low: _Number
-    high: _Number
+    low: Finite
+    high: Finite
     description: str = ""
     whole: bool = False
     observed: bool = False
@@ -264,7 +261,7 @@ def _check_name(name: str) -> None:
             f"{name!r} cannot be the name of an environment",
             "write name = ... in [env]: up to 40 letters, digits, '-' and '_', a letter first",
         )
-    if name in ENVIRONMENTS or name == _RESERVED:
+    if name in ENVIRONMENTS or name == CONTROL:
         raise UsageError(
             f"{name!r} is the name of another environment",
             "rename the file, or write name = ... in [env]",
@@ -282,7 +279,7 @@ def _check_arguments(value: Any, where: str) -> None:
                 _check_arguments(inner, where)
         case bool() | str():
             pass
-        case int() | float() if math.isfinite(value) and abs(value) <= _MAX_NUMBER:
+        case int() | float() if math.isfinite(value) and abs(value) <= MAX_FLOAT:
             pass
         case _:
             raise UsageError(

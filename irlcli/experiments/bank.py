@@ -22,24 +22,6 @@ from irlcli.stages.base import From, Request, Source
 from irlcli.store import Artefact, Store
 
 
-class Member(NamedTuple):
-    """A policy of a bank.
-
-    Attributes:
-        policy: None for an agent without one.
-        noise: that is added to its actions.
-        ceiling: of the rewards it was retrained on; None without.
-        gamma: of its training; None if it was not retrained.
-    """
-
-    name: str
-    kind: str
-    policy: Source | From | None = None
-    noise: float = 0.0
-    ceiling: float | None = None
-    gamma: float | None = None
-
-
 class Policies(NamedTuple):
     """The policies of a bank besides the idle and the random agent.
 
@@ -48,7 +30,7 @@ class Policies(NamedTuple):
         student: trained together with the reward.
         reused: experts of other settings, by the setting each was trained in.
         experts: each setting's own, by setting.
-        retrained: by the setting of the training.
+        retrained: on the reward, by their entries.
         substitutes: settings whose expert is not the one behind their demonstrations.
     """
 
@@ -56,7 +38,7 @@ class Policies(NamedTuple):
     student: Source | From | None
     reused: Mapping[str, Source | From]
     experts: Mapping[str, Source | From]
-    retrained: Mapping[str, Sequence[Member]]
+    retrained: Mapping[Entry, Source | From]
     substitutes: Sequence[str] = ()
 
 
@@ -66,42 +48,44 @@ def bank(
     """The entries of a bank in ``settings``, each with the request that records its episodes."""
     found: dict[Entry, Request] = {}
     for setting in settings:
-        for member in _members(str(setting), config, policies):
-            entry = Entry(
-                policy=member.name,
-                kind=member.kind,
-                setting=str(setting),
-                ceiling=member.ceiling,
-                gamma=member.gamma,
-            )
+        for entry, policy, noise in _members(str(setting), config, policies):
             found[entry] = record.request(
                 env,
                 setting,
                 config.evaluation,
-                member.policy,
-                agent="policy" if member.policy is not None else member.kind,  # type: ignore[arg-type]
-                noise=member.noise,
+                policy,
+                agent="policy" if policy is not None else entry.kind,  # type: ignore[arg-type]
+                noise=noise,
                 seed=seed,
-                policy_label=member.name,
+                policy_label=entry.policy,
             )
     return found
 
 
-def _members(setting: str, config: Config, policies: Policies) -> Iterator[Member]:
-    yield Member("idle", "idle")
-    yield Member("random", "random")
+def _members(
+    setting: str, config: Config, policies: Policies
+) -> Iterator[tuple[Entry, Source | From | None, float]]:
+    """Each entry in ``setting``, its policy (None for an agent without one), and the noise of its actions."""
+
+    def entry(name: str, kind: str) -> Entry:
+        return Entry(policy=name, kind=kind, setting=setting)
+
+    yield entry("idle", "idle"), None, 0.0
+    yield entry("random", "random"), None, 0.0
     if policies.clone is not None:
         for noise in dict.fromkeys(config.assessment.noise):
-            yield Member(f"clone, noise {noise}", "clone", policies.clone, noise)
+            yield entry(f"clone, noise {noise}", "clone"), policies.clone, noise
     if policies.student is not None:
-        yield Member("student", "student", policies.student)
+        yield entry("student", "student"), policies.student, 0.0
     for trained, expert in policies.reused.items():
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         if trained != setting and expert != policies.experts.get(setting):
-            yield Member(f"expert of {trained}", "reused", expert)
+            yield entry(f"expert of {trained}", "reused"), expert, 0.0
     if setting in policies.experts:
-        yield Member(f"expert of {setting}", "expert", policies.experts[setting])
-    yield from policies.retrained.get(setting, ())
+        yield entry(f"expert of {setting}", "expert"), policies.experts[setting], 0.0
+    for retrained, policy in policies.retrained.items():
+        if retrained.setting == setting:
+            yield retrained, policy, 0.0
 
 
 class Finder:
@@ -122,7 +106,9 @@ class Finder:
     def demonstrations(self, reward: Source) -> Source | None:
         """What ``reward`` was learned from, if it is in the store."""
         maker = self._maker(reward)
-        return None if maker is None else self._input(maker, "demonstrations", None)
+        sha = "" if maker is None else maker.manifest.record.inputs.get("demonstrations", "")
+        holders = self._index.holders(sha)
+        return source_in(holders[0], None) if holders else None
 
     def policies(
         self,
@@ -162,7 +148,7 @@ class Finder:
             student=self._student(reward, origin),
             reused={text: experts[text] for text in origin.settings if text in experts},
             experts=experts,
-            retrained={str(s): self._retrained(reward, str(s)) for s in settings},
+            retrained=self._retrained(reward),
             substitutes=substitutes,
         )
 
@@ -171,11 +157,6 @@ class Finder:
         makers = [reward.artefact] if reward.artefact else self._index.holders(reward.sha256)
         found = (a for a in makers if a.manifest.record.stage == "train-airl")
         return next(found, None)
-
-    def _input(self, artefact: Artefact, role: str, output: str | None) -> Source | None:
-        sha = artefact.manifest.record.inputs.get(role)
-        holders = [] if sha is None else self._index.holders(sha)
-        return source_in(holders[0], output) if holders else None
 
     def _expert(self, env: str, text: str, recorded: str | None) -> Source | From | None:
         """The expert with the digest ``recorded``, or else the one that the config asks for."""
@@ -206,24 +187,27 @@ class Finder:
         except NotFound:
             return None
 
-    def _retrained(self, reward: Source, setting: str) -> list[Member]:
-        found = []
+    def _retrained(self, reward: Source) -> dict[Entry, Source]:
+        found = {}
         for artefact in self._index.artefacts.values():
-            record_ = artefact.manifest.record
+            made = artefact.manifest.record
+            trained, setting = made.parameters.get("transfer"), made.parameters.get("setting")
             if (
-                record_.stage == "transfer"
-                and record_.inputs.get("reward") == reward.sha256
-                and record_.parameters.get("setting") == setting
-                and isinstance(record_.parameters.get("transfer"), dict)
+                made.stage == "transfer"
+                and made.inputs.get("reward") == reward.sha256
+                and isinstance(trained, dict)
+                and isinstance(setting, str)
                 and any(output.path == "policy.pt" for output in artefact.manifest.outputs)
             ):
-                name = f"retrained {artefact.id[:8]} {labels.retrained_as(record_)}".strip()
-                policy = source_in(artefact, "policy.pt")
-                trained = record_.parameters["transfer"]
-                kind = "from-student" if "start" in record_.inputs else "retrained"
-                ceiling, gamma = trained.get("ceiling"), _gamma(trained)
-                found.append(Member(name, kind, policy, ceiling=ceiling, gamma=gamma))
-        return sorted(found, key=lambda member: member.name)
+                entry = Entry(
+                    policy=f"retrained {artefact.id[:8]} {labels.retrained_as(made)}".strip(),
+                    kind="from-student" if "start" in made.inputs else "retrained",
+                    setting=setting,
+                    ceiling=trained.get("ceiling"),
+                    gamma=_gamma(trained),
+                )
+                found[entry] = source_in(artefact, "policy.pt")
+        return dict(sorted(found.items(), key=lambda item: item[0].policy))
 
 
 def _recorded(demos: Source | None, setting: str) -> str | None:

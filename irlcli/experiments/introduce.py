@@ -13,7 +13,7 @@ import msgspec
 from irlcli.envs import registry
 from irlcli.envs.spec import Code, EnvironmentSpec
 from irlcli.errors import IntegrityError, UsageError
-from irlcli.stages.base import EnvironmentKey, OwnKey, Request
+from irlcli.stages.base import EnvironmentKey, OwnKey, Request, key_of
 from irlcli.store import Artefact
 
 
@@ -99,13 +99,6 @@ def _described(artefact: Artefact, made: EnvironmentKey, own: OwnKey) -> Environ
 
 def _is_made_in(spec: EnvironmentSpec, made: EnvironmentKey, own: OwnKey) -> bool:
     """Whether ``spec`` is the environment that the key of an artefact holds."""
-    if spec.own is None:
+    if not own.knobs.keys() <= spec.knobs.keys():
         return False
-    knobs = {name: knob.argument for name, knob in spec.knobs.items()}
-    return (
-        (spec.name, spec.max_episode_steps, spec.own.id, spec.entry_point or None)
-        == (made.name, made.max_episode_steps, own.id, own.entry_point)
-        and spec.own.arguments == own.arguments
-        and spec.own.code == Code(own.sha256, own.distribution, own.version)
-        and own.knobs.items() <= knobs.items()
-    )
+    return key_of(spec, own.knobs) == msgspec.structs.replace(made, physics=spec.physics)

@@ -27,7 +27,7 @@ from irlcli import labels
 from irlcli.data import descriptions
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
-from irlcli.experiments.bank import Member, Policies, bank
+from irlcli.experiments.bank import Policies, bank
 from irlcli.experiments.status import Lookup
 from irlcli.experiments.tables import Row
 from irlcli.experiments.variants import ConfigOf
@@ -304,20 +304,20 @@ def _run(
     yield Task(run.name, "rewards", learned)
     reward = _Reward(requests, demos, learned, run, measures)
     yield from _imitation(reward)
-    retrained: dict[str, list[Member]] = {}
+    retrained: dict[assess.Entry, From] = {}
     for measure in (measure for measure in RETRAINED if measure in measures):
         for retraining in range(retrainings):
             for setting in trained if measure == "transfer-id" else requests.unseen:
                 moved = _retraining(reward, measure, setting, retraining)
                 yield from _retrained(reward, moved, measure, setting, retraining)
-                member = Member(
-                    _known_as(measure, retraining),
-                    "from-student" if measure == "from-student" else "retrained",
-                    From(moved, "policy.pt"),
+                entry = assess.Entry(
+                    policy=_known_as(measure, retraining),
+                    kind="from-student" if measure == "from-student" else "retrained",
+                    setting=str(setting),
                     ceiling=moved.parameters.transfer.ceiling,
                     gamma=moved.parameters.transfer.algorithm_config.gamma,
                 )
-                retrained.setdefault(str(setting), []).append(member)
+                retrained[entry] = From(moved, "policy.pt")
     if "transfer" in measures:
         yield _expert_by_reward(reward)
     if CUE in measures:
@@ -356,7 +356,7 @@ def _expert_by_reward(reward: _Reward) -> Task:
     return Task(f"{reward.run.name}.expert-by-reward", "returns", request, cell)
 
 
-def _assessment(reward: _Reward, retrained: Mapping[str, Sequence[Member]]) -> Iterator[Task]:
+def _assessment(reward: _Reward, retrained: Mapping[assess.Entry, From]) -> Iterator[Task]:
     """The bank of a row's policies, and how well the reward ranks them.
 
     It has the unseen setting only where another measure does.

@@ -73,7 +73,7 @@ def assess(
         reward_label(origin.airl, origin.seed),
     )
     retrain = None
-    if not any(policies.retrained.values()):
+    if not any(e.kind in ("retrained", "from-student") for e in request.parameters.bank):
         # A built-in environment is known from the reward, and so is one that its artefact describes.
         file = _file(origin.env)
         named = () if file is None else ("--env", file)

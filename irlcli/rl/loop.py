@@ -19,7 +19,17 @@ Row = dict[str, Any]
 State = dict[str, Any]
 
 
-class Trainer(Protocol):
+class Resumable(Protocol):
+    """A part of a training that a checkpoint holds."""
+
+    def state_dict(self) -> State:
+        """What a resumed run needs from the end of the last round."""
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from ``state_dict()``."""
+
+
+class Trainer(Resumable, Protocol):
     """A policy and the algorithm that trains it, one seeded round at a time."""
 
     @property
@@ -41,14 +51,8 @@ class Trainer(Protocol):
     def train_round(self, index: int, source: RewardSource) -> list[Rollout]:
         """Run round ``index`` on the rewards of ``source``, from fresh episodes."""
 
-    def state_dict(self) -> State:
-        """What a resumed run needs from the end of the last round."""
 
-    def load_state_dict(self, state: State) -> None:
-        """Continue from ``state_dict()``."""
-
-
-class Learner(Protocol):
+class Learner(Resumable, Protocol):
     """What learns from the policy's rollouts while the policy learns."""
 
     def begin(self, trainer: Trainer) -> None:
@@ -66,14 +70,8 @@ class Learner(Protocol):
         ``challenger_rollouts`` are the rollouts of a challenger, if there is one.
         """
 
-    def state_dict(self) -> State:
-        """What a resumed run needs."""
 
-    def load_state_dict(self, state: State) -> None:
-        """Continue from ``state_dict()``."""
-
-
-class Selector(Protocol):
+class Selector(Resumable, Protocol):
     """Which round's networks are kept."""
 
     def consider(self, index: int, policy: Policy) -> dict[str, float]:
@@ -81,12 +79,6 @@ class Selector(Protocol):
 
     def restore(self, policy: Policy) -> None:
         """Put the networks of the chosen round back in place."""
-
-    def state_dict(self) -> State:
-        """What a resumed run needs."""
-
-    def load_state_dict(self, state: State) -> None:
-        """Continue from ``state_dict()``."""
 
 
 class Training:
@@ -215,7 +207,7 @@ class Training:
                 )
 
     @property
-    def _parts(self) -> dict[str, Any]:
+    def _parts(self) -> dict[str, Resumable]:
         """What a checkpoint holds, by name."""
         parts = {
             "trainer": self.trainer,

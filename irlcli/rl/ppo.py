@@ -78,6 +78,7 @@ class PPOTrainer:
         torch.set_num_threads(1)
         self.ppo = ppo
         self.total_steps = total_steps
+        self.steps_per_round, self.rounds = ppo.steps_per_round, ppo.rounds(total_steps)
         self._seed = seed
         self._purpose = purpose
         self._keep_moments = keep_moments
@@ -113,16 +114,6 @@ class PPOTrainer:
     def steps(self) -> int:
         """Environment steps taken so far."""
         return self.model.num_timesteps
-
-    @property
-    def steps_per_round(self) -> int:
-        """Environment steps of one round."""
-        return self.ppo.steps_per_round
-
-    @property
-    def rounds(self) -> int:
-        """Rounds that make up at least ``total_steps``."""
-        return self.ppo.rounds(self.total_steps)
 
     @property
     def policy(self) -> Policy:

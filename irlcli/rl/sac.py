@@ -75,7 +75,7 @@ class SACTrainer:
     def __init__(self, worlds: Worlds, sac: SACConfig, total_steps: int, seed: int, purpose: str):
         torch.set_num_threads(1)
         self.sac = sac
-        self.total_steps = total_steps
+        self.steps_per_round, self.rounds = sac.steps_per_round, sac.rounds(total_steps)
         self.steps = 0
         self._seed = seed
         self._purpose = purpose
@@ -107,16 +107,6 @@ class SACTrainer:
         self._replay = self.model.replay_buffer
         if sac.normalise_rewards:
             self._replay.deviation = self._deviation
-
-    @property
-    def steps_per_round(self) -> int:
-        """Environment steps of one round."""
-        return self.sac.steps_per_round
-
-    @property
-    def rounds(self) -> int:
-        """Rounds that make up at least ``total_steps``."""
-        return self.sac.rounds(self.total_steps)
 
     @property
     def policy(self) -> Policy:

@@ -5,13 +5,14 @@ and cache hits import every stage module, so each imports torch, gymnasium, pyar
 inside ``run`` only.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
 
 from irlcli.envs.registry import environment
+from irlcli.envs.spec import EnvironmentSpec
 from irlcli.interventions import Setting
 from irlcli.store import Artefact
 
@@ -155,22 +156,24 @@ def environment_key(env: str, settings: Sequence[Setting] | None = None) -> Envi
         NotFound: its module cannot be imported.
     """
     spec = environment(env)
-    own = None
     if spec.own is not None:
         from irlcli.envs.own import check_code
 
         check_code(spec)
-        code = spec.own.code
-        changed = spec.knobs if settings is None else {k for s in settings for k in s.knobs}
+    return key_of(spec, spec.knobs if settings is None else {k for s in settings for k in s.knobs})
+
+
+def key_of(spec: EnvironmentSpec, changed: Collection[str]) -> EnvironmentKey:
+    """The key of the environment ``spec``; of one from outside the package, with the knobs ``changed``."""
+    own = None
+    if spec.own is not None:
         own = OwnKey(
             id=spec.own.id,
             entry_point=spec.entry_point or None,
             arguments=spec.own.arguments,
             knobs={name: spec.knobs[name].argument for name in sorted(changed)},
             whole=tuple(name for name in sorted(changed) if spec.knobs[name].whole),
-            sha256=code.sha256,
-            distribution=code.distribution,
-            version=code.version,
+            **spec.own.code._asdict(),
         )
     return EnvironmentKey(
         name=spec.name, physics=spec.physics, max_episode_steps=spec.max_episode_steps, own=own

@@ -161,12 +161,8 @@ class Store:
             NotFound: as that.
             StageFailed: the store cannot be written.
         """
-        try:
+        with self._writing():
             return references.remove_names(self._writable, patterns)
-        except OSError as error:
-            raise StageFailed(
-                f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
-            ) from None
 
     def set_name(self, name: str, artefact: Artefact) -> None:
         """Name an artefact, and warn if another one loses the name: gc may now delete that.
@@ -175,16 +171,21 @@ class Store:
             UsageError: as :func:`irlcli.store.references.check_name`.
             StageFailed: the store cannot be written.
         """
-        try:
+        with self._writing():
             before = references.set_name(self._writable, name, artefact)
-        except OSError as error:
-            raise StageFailed(
-                f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
-            ) from None
         if before is not None:
             undo = shlex.join(["irl", "name", before, name, *self.option])
             exists = (self.root / before).is_dir()
             self.warn(f"{name} no longer names {before}" + f"; `{undo}` undoes this" * exists)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise StageFailed(
+                f"the store {self.root} cannot be written: {error.strerror or error}", RETRY
+            ) from None
 
     # Working
 

@@ -235,19 +235,41 @@ def test_planning_and_hits_load_nothing_heavy(bench):
     assert done.stdout.splitlines()[-1] == "set()"
 
 
-def test_provenance_that_contradicts_the_key_is_refused(bench, publish):
-    artefact = made(bench, *IDLE, "--env", "cart.toml")
-    record = Store("runs").resolve(artefact).artefact.manifest.record
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"id": "os:Cart-v0"},
+        {"whole": ["mass"]},
+        {"max_episode_steps": 7},
+        {"name": "wagon"},
+    ],
+)
+def test_provenance_that_contradicts_the_key_is_refused(bench, publish, change):
+    made_there = Store("runs").resolve(made(bench, *IDLE, "--env", "cart.toml")).artefact
+    described = made_there.provenance()["environment"]
+    parameters = json.loads(json.dumps(made_there.manifest.record.parameters))
+    key = parameters["environment"]
+    (key if change.keys() & key.keys() else key["own"]).update(change)
     shutil.rmtree("runs")
-    for change in ({"id": "os:Cart-v0"}, {"max_episode_steps": 7}, {"name": "wagon"}, None):
-        store = Store("runs")
-        parameters = json.loads(json.dumps(record.parameters))
-        if change is not None:
-            own = parameters["environment"]["own"]
-            (own if "id" in change else parameters["environment"]).update(change)
-        published = publish(store, stage="evaluate", parameters=parameters)
-        refused = bench.irl("report", "returns", published.artefact.id)
-        assert refused.code == 4 and "--env" in refused.err, refused.err
+    published = publish(
+        Store("runs"), stage="evaluate", parameters=parameters, environment=described
+    )
+    done = bench.irl("report", "returns", published.artefact.id)
+    assert ("describes another environment than its key" in done.err) == bool(change), done.err
+    # What was published holds no evaluation, which is noticed where the environment is the key's.
+    assert done.code == (4 if change else 2)
+
+
+def test_an_artefact_that_does_not_describe_its_environment_is_refused(bench, publish):
+    record = (
+        Store("runs").resolve(made(bench, *IDLE, "--env", "cart.toml")).artefact.manifest.record
+    )
+    shutil.rmtree("runs")
+    published = publish(Store("runs"), stage="evaluate", parameters=record.parameters)
+    done = bench.irl("report", "returns", published.artefact.id)
+    assert done.code == 4 and "does not describe its environment" in done.err, done.err
+    assert "--env" in done.err
 
 
 def test_a_lab_takes_the_environment_from_each_artefact(bench):
