@@ -38,14 +38,18 @@ class Adapted(gymnasium.Wrapper):
     Args:
         env: the environment.
         name: what messages call it.
+        limit: the time limit [steps] of its description, which cuts the episodes outside this class;
+            None: not known yet.
 
     Raises:
         UsageError: spaces that no policy here has.
     """
 
-    def __init__(self, env: gymnasium.Env, name: str):
+    def __init__(self, env: gymnasium.Env, name: str, limit: int | None = None):
         super().__init__(env)
         self._name = name
+        self._limit = limit
+        self._steps = 0
         try:
             observations, actions = env.observation_space, env.action_space
         except AttributeError as error:
@@ -65,6 +69,7 @@ class Adapted(gymnasium.Wrapper):
         except (Exception, SystemExit) as error:
             raise self._failed("reset", error) from error
         self._last = self._seen(observation, "reset")
+        self._steps = 0
         return self._last.copy(), info
 
     @prints_aside()
@@ -95,6 +100,9 @@ class Adapted(gymnasium.Wrapper):
             self._flag("terminated", terminated),
             self._flag("truncated", truncated),
         )
+        self._steps += 1
+        if truncated and not terminated and info["error"] is None:
+            self._check_limit()
         truncated = truncated or info["error"] is not None
         # A simulation that failed has no next state: the last one stands for it.
         failed = None if info["error"] is None else self._last
@@ -135,6 +143,15 @@ class Adapted(gymnasium.Wrapper):
         if instead is None:
             raise self._wrong(method, "returned an observation that is not finite")
         return instead
+
+    def _check_limit(self) -> None:
+        """Refuse another time limit than the description's: the learners rely on that one."""
+        if self._limit is not None and self._steps < self._limit:
+            raise StageFailed(
+                f"{self._name}: step() truncated an episode after {self._steps} of {self._limit} steps",
+                f"set max_episode_steps = {self._steps} in [env] if that is its time limit, or return "
+                "terminated = True where an episode ends for another reason",
+            )
 
     def _flag(self, name: str, value: Any) -> bool:
         if np.size(value) != 1 or value not in (0, 1):

@@ -96,7 +96,8 @@ def build(
         register()
         imported(f"environment {spec.name!r}", spec.entry_point)
         return gymnasium.make(spec.gym_id, **arguments).unwrapped
-    world = Adapted(_own(spec, spec.own, arguments, f"{spec.name} {setting}"), spec.name)
+    inner = _own(spec, spec.own, arguments, f"{spec.name} {setting}")
+    world = Adapted(inner, spec.name, spec.max_episode_steps)
     discrete = not isinstance(world.action_space, gymnasium.spaces.Box)
     if discrete != spec.discrete_actions:
         found = "discrete" if discrete else "continuous"

@@ -120,6 +120,24 @@ def frozen_reward(
         )
 
 
+def deciding_score(
+    job: Job,
+    setting: str,
+    episodes: "Sequence[Trajectory]",
+    score: "Callable[[Trajectory], float]",
+) -> float:
+    """Mean ``score`` of a policy's ``episodes``, by which it is kept or not.
+
+    An episode that an error stopped lacks the rewards of its other steps; where these are negative it
+    would look like a success. It counts only if an error stopped all of them. They are named.
+    """
+    import numpy as np
+
+    job.warn_of_errors(setting, episodes)
+    whole = [episode for episode in episodes if episode.error is None]
+    return float(np.mean([score(episode) for episode in whole or episodes]))
+
+
 def warn_of_labels(job: Job, counts: Sequence[int]) -> None:
     """Warn if shuffled labels still tell settings with ``counts`` [E] demonstrations apart."""
     from irlcli.learners.grouping import hides_settings

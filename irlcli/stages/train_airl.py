@@ -20,6 +20,7 @@ from irlcli.methods import method_name
 from irlcli.penalties import check_risks, penalty_version
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
 from irlcli.stages.running import (
+    deciding_score,
     run_training,
     warn_of_failures,
     warn_of_labels,
@@ -216,7 +217,7 @@ def run(job: Job) -> None:
             worlds, airl.ppo, airl.total_steps, p.seed, STAGE.name, keep_moments=airl.bc_epochs > 0
         )
         learner = _learner(p, settings, episodes, held_out, worlds, trainer.rounds)
-        selector = _selector(p, learner, held_out, trainer.rounds)
+        selector = _selector(job, learner, held_out, trainer.rounds)
         challengers = None
         if airl.challenger.life > 0:
             theirs = [worlds]
@@ -363,15 +364,14 @@ def _symmetries(
 
 
 def _selector(
-    p: Parameters, learner: AIRL, held_out: Sequence[Sequence[Trajectory]], rounds: int
+    job: Job, learner: AIRL, held_out: Sequence[Sequence[Trajectory]], rounds: int
 ) -> BestRound | None:
     """What decides which round is kept, by ``airl.select``; none keeps the last."""
-    import numpy as np
-
     from irlcli.learners.discriminator import full_weight_from
     from irlcli.learners.selection import BestRound, log_likelihood
     from irlcli.rl.rollout import roll_out
 
+    p: Parameters = job.parameters
     airl = p.airl
     if airl.select == "last":
         return None
@@ -385,7 +385,7 @@ def _selector(
         found = roll_out(
             p.environment.name, where, policy, airl.select_episodes, p.seed, "selection"
         )
-        return float(np.mean([t.episode_return for t in found]))
+        return deciding_score(job, airl.select, found, lambda t: t.episode_return)
 
     score = likelihood if airl.select == "episodes" else true_return
     first = full_weight_from(airl.penalty_warmup_rounds, airl.penalty_ramp_rounds)

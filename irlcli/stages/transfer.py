@@ -17,7 +17,7 @@ from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.interventions import Setting, check_tabular, parse_setting
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Source, Stage, environment_key
-from irlcli.stages.running import frozen_reward, run_training
+from irlcli.stages.running import deciding_score, frozen_reward, run_training
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -154,8 +154,6 @@ def _training(
 
 def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:
     """Mean of ``policy`` over ``transfer.restart_episodes``, which are the same for every restart."""
-    import numpy as np
-
     from irlcli.rl.rollout import roll_out
 
     p: Parameters = job.parameters
@@ -165,8 +163,7 @@ def _learned_return(job: Job, reward: FrozenReward, policy: Policy) -> float:
     assert not isinstance(count, UnsetType)
     job.console.progress(0, count, "episodes", {"measuring": "learned return"})
     found = roll_out(p.environment.name, setting, policy, count, p.seed, "restart score")
-    job.warn_of_errors(p.setting, found)
-    return float(np.mean([reward.of_episode(t) for t in found]))
+    return deciding_score(job, p.setting, found, reward.of_episode)
 
 
 def _student(path: Path | None, config: Any) -> tuple[Policy | None, Any]:

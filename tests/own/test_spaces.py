@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from pathlib import Path
@@ -368,6 +369,7 @@ def test_the_example_passes_every_check(bench):
             "SystemExit",
         ),
         (RETURNED, "return 'text'", "it can be made", "no array"),
+        ("5.0, False", "5.0, True", "it can be made", "truncated an episode after 1 of 50 steps"),
         (
             "self.speed = 0.0",
             "self.speed = getattr(self, 'speed', 0.0)",
@@ -482,6 +484,47 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
     assert (
         checked.code == 1 and ("has actions in" if not observed else "numbers in an") in checked.out
     )
+
+
+class Limited(gymnasium.Env):
+    """Ends its episodes after three steps, as ``flags`` (terminated, truncated) say."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, flags, info):
+        self.flags, self.info = flags, info
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        flags = self.flags if self.steps == 3 else (False, False)
+        return np.zeros(1, np.float32), 0.0, *flags, self.info if self.steps == 3 else {}
+
+
+@pytest.mark.parametrize(
+    ("limit", "flags", "info", "refused"),
+    [
+        (4, (False, True), {}, True),
+        (3, (False, True), {}, False),
+        (4, (True, False), {}, False),
+        (4, (True, True), {}, False),
+        (4, (False, True), {"error": "it fell over"}, False),
+    ],
+)
+def test_a_shorter_time_limit_than_the_descriptions_is_refused(limit, flags, info, refused):
+    world, action = Adapted(Limited(flags, info), "limited", limit), np.zeros(1, np.float32)
+    for _ in range(2):
+        world.reset(seed=0)
+        assert not any(any(world.step(action)[2:4]) for _ in range(2))
+        with pytest.raises(StageFailed) if refused else contextlib.nullcontext() as failed:
+            assert any(world.step(action)[2:4])
+        if refused:
+            assert "after 3 of 4 steps" in failed.value.message
+            assert "max_episode_steps = 3" in failed.value.hint
 
 
 @pytest.mark.parametrize(("reward", "warned"), [(-100.0, True), (100.0, False)])

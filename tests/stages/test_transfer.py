@@ -14,15 +14,17 @@ import torch
 from irlcli.configs import load_config
 from irlcli.data.tensors import load_policy_file, load_reward_file
 from irlcli.errors import UsageError
+from irlcli.experiments.runner import Silent
 from irlcli.interventions import parse_setting
 from irlcli.learners.frozen import FrozenReward
 from irlcli.requests.arguments import warn_of_seen, where
 from irlcli.rl.ppo import PPOTrainer
 from irlcli.rl.rollout import roll_out
 from irlcli.rl.sac import SACTrainer
-from irlcli.stages.base import environment_key
-from irlcli.stages.running import frozen_reward
+from irlcli.stages.base import Job, environment_key
+from irlcli.stages.running import deciding_score, frozen_reward
 from irlcli.store import Store
+from irlcli.trajectories import Trajectory
 
 RELU = ["--set", "airl.ppo.activation=relu"]
 
@@ -370,6 +372,39 @@ def test_the_best_restart_alone_has_the_whole_budget(runs, irl):
 def test_restarts_as_long_as_the_whole_budget_are_refused(runs, irl):
     done = irl(*RESTARTS, "--set", "transfer.restart_steps=2048", *common(runs))
     assert done.code == 2 and "transfer.restart_steps" in done.err and "omit" in done.err
+
+
+class Heard(Silent):
+    """A console that remembers the warnings."""
+
+    def __init__(self):
+        self.warned = []
+
+    def warn(self, message):
+        self.warned.append(message)
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"),
+    [((None, None, None), -20.0), ((None, "burst", None), -15.0), (("burst",) * 3, -20.0)],
+)
+def test_an_episode_that_an_error_stopped_decides_nothing(tmp_path, errors, expected):
+    episodes = [
+        Trajectory(
+            np.zeros((length + 1, 1), np.float32),
+            np.zeros(length, np.int64),
+            np.full(length, -1.0),
+            *(False, True),
+            seed=k,
+            error=error,
+        )
+        for k, (length, error) in enumerate(zip((10, 30, 20), errors, strict=True))
+    ]
+    console = Heard()
+    job = Job(None, {}, tmp_path, None, console)
+    score = deciding_score(job, "gravity=1x", episodes, lambda t: t.episode_return)
+    assert score == expected
+    assert len(console.warned) == sum(error is not None for error in errors)
 
 
 def test_sac_restarts(runs, irl):
