@@ -183,7 +183,7 @@ def load_reward(
     Raises:
         IrlError: ``ref`` names no reward, the reward is damaged, or it does not fit the setting.
     """
-    from irlcli.envs.registry import forget, resolve
+    from irlcli.envs.registry import apart, resolve
     from irlcli.errors import IrlError, UsageError
     from irlcli.requests.in_python import in_python
 
@@ -199,14 +199,13 @@ def load_reward(
         )
     if ceiling is not None and not 0.0 <= ceiling <= 1.0:
         raise UsageError(f"ceiling = {ceiling:g} is not a quantile", "give a number from 0 to 1")
-    # Another call may have introduced another environment of the same name.
-    forget()
     place = fspath(ref)
     try:
-        if env is not None:
-            resolve(env)
-        home = Store(store_around(Path(place)) or Path(store))
-        return reward_in(home, place, setting, gamma, ceiling)
+        with apart():
+            if env is not None:
+                resolve(env)
+            home = Store(store_around(Path(place)) or Path(store))
+            return reward_in(home, place, setting, gamma, ceiling)
     except IrlError as error:
         error.message, error.hint = in_python(error.message), in_python(error.hint)
         raise

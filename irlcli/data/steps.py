@@ -195,6 +195,7 @@ class Check:
     _t: int = 0
     _ended: bool = True
     _setting: int = -1
+    _seed: int = -1
     _next: np.ndarray = field(default_factory=lambda: np.empty(0, np.float32))
 
     def __call__(self, parts: Iterable[Steps]) -> Iterator[Steps]:
@@ -246,6 +247,7 @@ class Check:
         )
         self._t = int(t[-1]) + 1
         self._ended, self._setting = bool(ended[-1]), int(steps.settings[-1])
+        self._seed = int(steps.seeds[-1])
         self._next = steps.next_observations[-1]
         whole = replace(
             steps,
@@ -312,6 +314,13 @@ class Check:
             goes_on & (settings != steps.settings),
             "the setting changes within an episode",
             "each episode is of one setting",
+        )
+        seeds = np.append(self._seed, steps.seeds[:-1])
+        _refuse(
+            steps,
+            goes_on & (seeds != steps.seeds),
+            "the seed changes within an episode",
+            "every step of an episode has the seed of its reset",
         )
         differs = goes_on.copy()
         differs[1:] &= (steps.next_observations[:-1] != steps.observations[1:]).any(1)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from irlcli.envs.adapted import prints_aside
 from irlcli.envs.registry import environment
 from irlcli.errors import StageFailed, UsageError, described, imported
 from irlcli.interventions import Setting, env_kwargs
@@ -30,10 +31,12 @@ def symmetries(
     """
     place = environment(env).symmetries
     assert place is not None
-    function = imported(f"environment {env!r}", place)
     arguments = [env_kwargs(env, setting) for setting in settings]
+    with prints_aside():
+        function = imported(f"environment {env!r}", place)
     try:
-        found: Any = function(arguments)
+        with prints_aside():
+            found: Any = function(arguments)
         check_group(found, observation_size, action_size)
     except Exception as error:
         # The function can be anybody's.

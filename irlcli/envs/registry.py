@@ -5,6 +5,8 @@ installed package announces in the entry-point group ``irlcli.environments``.
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from irlcli.envs.ant.spec import SPEC as ANT
@@ -85,3 +87,18 @@ def is_known(name: str) -> bool:
 def forget() -> None:
     """Forget every environment that was introduced."""
     _KNOWN.clear()
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Begin without the environments that were introduced; afterwards they have their names again.
+
+    Each call from Python takes an environment from the file or the artefact that it names, as a
+    command does.
+    """
+    before = dict(_KNOWN)
+    forget()
+    try:
+        yield
+    finally:
+        _KNOWN.update(before)

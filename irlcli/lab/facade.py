@@ -402,11 +402,10 @@ class Lab:
     def _at_work(
         self, configs: Configs, line: Sequence[str], read_only: bool = False
     ) -> Iterator[StageSession]:
-        # As a command does, each call takes an environment from the file or the artefact it names.
-        registry.forget()
-        session = self._session(configs, line, read_only)
-        with session.reading():
-            yield session
+        with registry.apart():
+            session = self._session(configs, line, read_only)
+            with session.reading():
+                yield session
 
     def _run(self, session: StageSession, request: Request, name: str | None) -> Stored:
         session.warn_before([request])

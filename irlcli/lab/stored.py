@@ -74,10 +74,12 @@ class Stored:
             NotFound: there is no such output.
             IntegrityError: it is damaged.
         """
+        with registry.apart():
+            return self._table(output)
+
+    def _table(self, output: str | None) -> pd.DataFrame:
         import pandas as pd
 
-        # Another call may have introduced another environment of the same name.
-        registry.forget()
         store, artefact = self._session.store, self._artefact
         if output is None and self.stage == "evaluate":
             run = measured(self._session, artefact)

@@ -72,6 +72,7 @@ def run(job: Job) -> None:
     from irlcli.configs import PPOConfig
     from irlcli.data.demonstrations import read_demonstrations
     from irlcli.data.outputs import write_policy
+    from irlcli.envs.spaces import check_spaces
     from irlcli.errors import IntegrityError
     from irlcli.learners.actions import ActionView, check_fit
     from irlcli.learners.cloning import clone
@@ -85,9 +86,10 @@ def run(job: Job) -> None:
     demos.require(env, p.settings)
     # The trainer is only there for its policy: it never acts.
     ppo = PPOConfig(n_envs=1, n_steps=2, batch_size=2, **msgspec.structs.asdict(p.network))
-    setting = parse_setting(env, p.settings[0])
+    settings = [parse_setting(env, text) for text in p.settings]
+    check_spaces(env, settings)
     episodes = [t for text in p.settings for t in demos.trajectories[text]]
-    with closing(make_worlds(env, [setting], 1)) as worlds:
+    with closing(make_worlds(env, settings[:1], 1)) as worlds:
         trainer = PPOTrainer(worlds, ppo, 2, p.seed, STAGE.name, keep_moments=True)
         space = action_space(worlds.action_space)
         size = observation_size(worlds.observation_space)
@@ -96,7 +98,7 @@ def run(job: Job) -> None:
             data = transitions(episodes, p.environment.max_episode_steps)
             check_fit(data, size, space)
         except ValueError as error:
-            raise IntegrityError(f"{env} {setting}: {error}") from None
+            raise IntegrityError(f"{env} {settings[0]}: {error}") from None
         clone(trainer, view.of(data), view, p.clone.epochs, p.seed)
     write_policy(
         job.output,

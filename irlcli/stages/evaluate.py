@@ -110,6 +110,7 @@ def run(job: Job) -> None:
 
     from irlcli.data.outputs import write_json, write_rows
     from irlcli.data.tensors import load_policy_file, load_reward_file
+    from irlcli.envs.spaces import check_spaces
 
     p: Parameters = job.parameters
     policy: Policy | str = p.agent
@@ -118,6 +119,9 @@ def run(job: Job) -> None:
         policy, origin = load_policy_file(job.inputs["policy"])
         subject = msgspec.to_builtins(origin)
         del subject["network"]
+        env = p.environment.name
+        together = [parse_setting(env, text) for text in (*p.settings, *origin.settings)]
+        check_spaces(env, together)
     document = {"policy": subject}
     if "reward" in job.inputs:
         model, learned = load_reward_file(job.inputs["reward"])

@@ -137,8 +137,10 @@ def _bounded(
 
     outside = far = total = 0
     for part in parts:
-        beyond = (part.observations < bounds[0]) | (part.observations > bounds[1])
-        outside, total = outside + int(beyond.any(-1).sum()), total + len(part)
+        # The last observation of an episode is in no other step.
+        for seen in (part.observations, part.next_observations[part.ended]):
+            outside += int(((seen < bounds[0]) | (seen > bounds[1])).any(-1).sum())
+        total += len(part)
         if not actions.discrete:
             middle, reach = (actions.high + actions.low) / 2, (actions.high - actions.low) / 2
             far += int((np.abs(part.actions - middle) > _FAR * reach).any(-1).sum())
@@ -150,7 +152,7 @@ def _bounded(
         )
     if outside:
         job.console.warn(
-            f"{outside:,} of {total:,} steps have observations outside the environment's bounds: check "
+            f"{outside:,} observations of {total:,} steps lie outside the environment's bounds: check "
             "their units, and that they are not normalised"
         )
 
@@ -164,8 +166,10 @@ def _spaces(env: str, settings: Sequence[Setting]) -> tuple[np.ndarray, ActionSp
 
     from irlcli.envs.adapted import first_index
     from irlcli.envs.registration import make
+    from irlcli.envs.spaces import check_spaces
     from irlcli.rl.worlds import action_space
 
+    check_spaces(env, settings)
     found = []
     for setting in settings:
         with closing(make(env, setting)) as world:

@@ -22,6 +22,12 @@ def explained(error: Exception, url: str) -> IrlError:
             f"{url}: no credentials were found",
             "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE (docs/sharing.md)",
         )
+    if isinstance(error, TypeError) and "__init__()" in text:
+        # The protocol's class needs arguments that a URL does not give.
+        return UsageError(
+            f"{url}: {protocol!r} needs more than a URL ({text})",
+            "name a directory, or a URL such as s3://BUCKET/PATH",
+        )
     if "ParamValidationError" in kinds:
         return UsageError(
             f"{url} is not a valid URL ({' '.join(str(error).split())})",

@@ -39,6 +39,8 @@ def open_place(place: Path | str, warn: Callable[[str], None], read_only: bool =
         raise UsageError(
             "the name of a store is empty", "name a directory or a URL: s3://BUCKET/PATH"
         )
+    if "://" in text and not text.partition("://")[2].strip("/"):
+        raise UsageError(f"{text} names no bucket or path", "write one, as in s3://BUCKET/PATH")
     if text.startswith("file://"):
         text = text.removeprefix("file://")
     elif "://" in text:

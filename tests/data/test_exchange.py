@@ -214,6 +214,7 @@ def changed(column, row, value):
         (changed("setting", 5, "bounce=0.1"), 5, "the setting changes within an episode"),
         (changed("terminated", 4, True), 5, "the episode has steps after its end"),
         (changed("obs", 5, [9.0, 9.0, 9.0]), 5, "obs differs from next_obs"),
+        (changed("seed", 5, 9), 5, "the seed changes within an episode"),
         (changed("episode", 8, 0), 8, "episode 0 begins again"),
         (changed("episode", 2, None), 2, "episode is missing"),
         (changed("episode", 2, float("nan")), 2, "episode is not finite"),
@@ -260,6 +261,17 @@ def test_an_episode_column_of_lists_is_named(tmp_path):
     pq.write_table(made, tmp_path / "a.parquet")
     with pytest.raises(UsageError, match="row 0: episode is a list"):
         imported(tmp_path / "out", tmp_path / "a.parquet", texts=TEXTS[:1])
+
+
+def test_numbers_of_episodes_are_of_any_width(tmp_path):
+    rng = np.random.default_rng(0)
+    made = table([episode(rng, n) for n in (3, 1, 2)], TEXTS[:1])
+    at = made.schema.get_field_index("episode")
+    for kind in (pa.uint8(), pa.float16(), pa.float64(), pa.string()):
+        named = pa.array(np.asarray(made["episode"]).astype(str)).cast(pa.int32()).cast(kind)
+        pq.write_table(made.set_column(at, "episode", named), tmp_path / f"{kind}.parquet")
+        demos, _, _ = imported(tmp_path / str(kind), tmp_path / f"{kind}.parquet", texts=TEXTS[:1])
+        assert [len(t) for t in demos.trajectories[TEXTS[0]]] == [3, 1, 2]
 
 
 def test_seeds_that_a_dataset_cannot_hold_are_unknown(tmp_path):

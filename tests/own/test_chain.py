@@ -355,6 +355,15 @@ def test_seeds_share_a_row_however_many_settings_each_was_evaluated_in(bench):
     assert len(rows) == 2 and seeds == {"mass=4x": 2, "drag=0.5": 1}
 
 
+def test_what_a_user_resolved_keeps_its_name(bench, smoke_store):
+    """Calls take environments from what they name, and leave the names as they were."""
+    cart = registry.resolve("cart.toml")
+    irlcli.load_reward("airl", store=smoke_store.path)
+    lab = irlcli.Lab(smoke_store.path, profile="smoke")
+    assert lab.artefact("demos").to_pandas()["setting"].nunique() == 2
+    assert registry.environment("cart") is cart
+
+
 def test_an_environment_without_pictures_is_named_by_irl_play(bench):
     bench.edit(bench.module, ", render_mode=None", "")
     bench.edit(bench.module, "        self.render_mode = render_mode\n", "")

@@ -414,6 +414,13 @@ def test_declared_symmetries_are_checked(bench, old, new, verdict, named):
     assert named in lines[lines.index(f"{verdict}  its symmetries") + 1]
 
 
+def test_what_declared_symmetries_print_goes_to_stderr(bench):
+    bench.declare_symmetries()
+    bench.edit(bench.module, "    both = ", "    print('turned')\n    both = ")
+    done = bench.irl("envs", "check", "cart.toml", "--json")
+    assert json.loads(done.out) and "turned" in done.err
+
+
 def test_a_knob_that_extends_the_observation_must_say_so(bench):
     bench.edit(bench.module, "drag=0.1,", "drag=None,")
     bench.edit(
@@ -433,6 +440,27 @@ def test_a_knob_that_extends_the_observation_must_say_so(bench):
     bench.edit(bench.toml, 'argument = "drag"', 'argument = "drag"\nobserved = true')
     again = bench.irl("envs", "check", "cart.toml")
     assert again.code == 0, again.out
+
+
+def test_an_observed_knob_must_change_something_too(bench):
+    """With it an observation has an entry more, whatever its value."""
+    bench.edit(
+        bench.module,
+        "self.drag = drag",
+        f"self.drag = 0.1\n        self.observation_space = {SPACES}Box(-10.0, 10.0, (2 + bool(drag),))",
+    )
+    bench.edit(bench.module, "drag=0.1,", "drag=None,")
+    bench.edit(
+        bench.module,
+        RETURNED,
+        "seen = [self.position, self.speed, 0.0][: self.observation_space.shape[0]]\n"
+        "        return np.clip(seen, -10.0, 10.0).astype(np.float32)",
+    )
+    bench.edit(bench.toml, 'argument = "drag"', 'argument = "drag"\nobserved = true')
+    bench.edit(bench.toml, "low = 0.0", "low = 0.1")
+    done = bench.irl("envs", "check", "cart.toml")
+    lines = done.out.splitlines()
+    assert "are equal" in lines[lines.index("FAIL  drag: it changes episodes") + 1]
 
 
 FORCES = "self.action_space = gymnasium.spaces.Box(-mass_scale, mass_scale, (1,), np.float32)"
@@ -471,6 +499,24 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
     done = bench.irl(*COLLECT, "--intervention", "mass=2x,3x", "--name", "demos")
     error, hint = done.err.splitlines()[-2:]
     assert done.code == 2 and named in error and hint.startswith("hint: "), done.err
+    expert = json.loads(bench.irl("lineage", "one", "--json").out)["inputs"][0]["from"]["id"]
+    scored = bench.irl(
+        "evaluate", "--policy", expert, "--episodes", "1", "--intervention", "mass=3x"
+    )
+    assert scored.code == 2 and ("actions in" in scored.err or "observation" in scored.err)
+    both = ("--env", "cart.toml", "--intervention", "mass=2x,3x")
+    bench.irl("export", "demos", "one", "--to", "parquet:one.parquet")
+    table = pq.read_table("one.parquet")
+    twice = pa.concat_tables([table, table])
+    for name, values in (
+        ("setting", ["mass=2x"] * len(table) + ["mass=3x"] * len(table)),
+        ("episode", [*range(2 * len(table))]),
+    ):
+        place = twice.schema.get_field_index(name)
+        twice = twice.set_column(place, name, pa.array(values))
+    pq.write_table(twice, "both.parquet")
+    recorded = bench.irl("import", "both.parquet", *both, "--setting-column", "setting")
+    assert recorded.code == 2 and ("actions in" in recorded.err or "observation" in recorded.err)
     # Before the expert of 3x is trained.
     assert "3x" not in bench.irl("ls", "--stage", "train-expert").out
     Path("tables.toml").write_text(TABLE)

@@ -13,10 +13,11 @@ import fsspec
 import pytest
 from places import at, files_of, memory, other, pull, push
 
-from irlcli.errors import IntegrityError, StageFailed
+from irlcli.errors import IntegrityError, StageFailed, UsageError
 from irlcli.store import Artefact, Store
 from irlcli.store import remote as remotes
 from irlcli.store.remote import Remote
+from irlcli.store.remote_errors import explained
 
 # What is damaged or missing
 
@@ -228,6 +229,23 @@ def test_a_place_that_is_no_store(irl, tmp_path, place, code, words):
     error, hint = result.err.splitlines()
     assert result.code == code and words in error and hint.startswith("hint: ")
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("place", ["s3://", "s3:///", "memory://", "file://"])
+def test_a_url_of_nothing_is_no_directory(irl, store, chain, tmp_path, monkeypatch, place):
+    """`s3://$BUCKET` with an empty variable."""
+    monkeypatch.chdir(tmp_path)
+    before = set(tmp_path.iterdir())
+    for line in (("push", "irm-0", "--to"), ("pull", "irm-0", "--from"), ("ls", "--from")):
+        result = irl(*line, place, "--store", store.root)
+        assert result.code == 2 and f"{place} names no bucket or path" in result.err, result.err
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_a_protocol_that_needs_more_than_a_url_is_bad_usage():
+    error = TypeError("GithubFileSystem.__init__() missing 2 required positional arguments")
+    assert isinstance(explained(error, "github://x"), UsageError)
+    assert isinstance(explained(TypeError("a bug"), "github://x"), StageFailed)
 
 
 def test_a_bucket_that_cannot_be_used(irl, store, chain, bucket, monkeypatch):

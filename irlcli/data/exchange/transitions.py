@@ -166,6 +166,9 @@ class _EpisodeStarts:
         if pa.types.is_nested(named.type):
             raise UsageError(f"{place(0)}: episode is a list", "write a number or text")
         require_all(named, "episode", place)
+        if pa.types.is_float16(named.type):
+            # Arrow compares no half floats.
+            named = named.cast(pa.float32())
         if pa.types.is_floating(named.type):
             finite = pc.is_finite(named)
             if not pc.all(finite).as_py():
