@@ -1,5 +1,6 @@
 """docs/notebook.ipynb runs from a clone, and shows each stage once."""
 
+import re
 from pathlib import Path
 
 import nbformat
@@ -46,3 +47,19 @@ def test_the_outputs_are_kept():
     counts = [cell.execution_count for cell in saved.cells if cell.cell_type == "code"]
     assert counts == list(range(1, len(counts) + 1))
     assert lines(saved, "lab.train_airl")[0].startswith("DONE train-airl irm")
+
+
+def test_the_kept_messages_are_those_of_now(executed):
+    kept, now = (
+        [
+            output.text
+            for cell in notebook.cells
+            for output in cell.get("outputs", [])
+            if "text" in output
+        ]
+        for notebook in (nbformat.read(PAGE, as_version=4), executed)
+    )
+    # Ids of learned rewards differ between kinds of processor.
+    assert [re.sub("[0-9a-f]{16}", "ID", text) for text in kept] == [
+        re.sub("[0-9a-f]{16}", "ID", text) for text in now
+    ]
