@@ -47,8 +47,8 @@ def push(
     """
     from irlcli.store.sources import open_place
 
-    session.check_exists()
     place = open_place(to, session.console.warn)
+    session.check_exists()
     source: Place = session.store
     if everything:
         # Otherwise the first damaged artefact would be moved to quarantine, and end the command.

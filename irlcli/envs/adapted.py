@@ -147,7 +147,7 @@ class Adapted(gymnasium.Wrapper):
     def _check_limit(self) -> None:
         """Refuse another time limit than the description's: the learners rely on that one."""
         if self._limit is not None and self._steps < self._limit:
-            raise StageFailed(
+            raise UsageError(
                 f"{self._name}: step() truncated an episode after {self._steps} of {self._limit} steps",
                 f"set max_episode_steps = {self._steps} in [env] if that is its time limit, or return "
                 "terminated = True where an episode ends for another reason",

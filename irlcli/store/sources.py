@@ -39,8 +39,10 @@ def open_place(place: Path | str, warn: Callable[[str], None], read_only: bool =
         raise UsageError(
             "the name of a store is empty", "name a directory or a URL: s3://BUCKET/PATH"
         )
-    if "://" in text and not text.partition("://")[2].strip("/"):
-        raise UsageError(f"{text} names no bucket or path", "write one, as in s3://BUCKET/PATH")
+    scheme, colon, rest = text.partition("://")
+    if colon and not rest.strip("/"):
+        path = "/PATH" if scheme == "file" else "BUCKET/PATH"
+        raise UsageError(f"{text} names no bucket or path", f"write one, as in {scheme}://{path}")
     if text.startswith("file://"):
         text = text.removeprefix("file://")
     elif "://" in text:

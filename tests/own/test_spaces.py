@@ -19,7 +19,7 @@ from irlcli.data.demonstrations import read_demonstrations
 from irlcli.envs.adapted import Adapted
 from irlcli.envs.registry import resolve
 from irlcli.envs.vector import VectorWorlds
-from irlcli.errors import StageFailed
+from irlcli.errors import StageFailed, UsageError
 from irlcli.interventions import parse_setting
 from irlcli.rl.rollout import roll_out
 from irlcli.store import Store
@@ -369,7 +369,7 @@ def test_the_example_passes_every_check(bench):
             "SystemExit",
         ),
         (RETURNED, "return 'text'", "it can be made", "no array"),
-        ("5.0, False", "5.0, True", "it can be made", "truncated an episode after 1 of 50 steps"),
+        ("5.0, False", "5.0, True", "it can be made", "set max_episode_steps = 1 in [env]"),
         (
             "self.speed = 0.0",
             "self.speed = getattr(self, 'speed', 0.0)",
@@ -566,7 +566,7 @@ def test_a_shorter_time_limit_than_the_descriptions_is_refused(limit, flags, inf
     for _ in range(2):
         world.reset(seed=0)
         assert not any(any(world.step(action)[2:4]) for _ in range(2))
-        with pytest.raises(StageFailed) if refused else contextlib.nullcontext() as failed:
+        with pytest.raises(UsageError) if refused else contextlib.nullcontext() as failed:
             assert any(world.step(action)[2:4])
         if refused:
             assert "after 3 of 4 steps" in failed.value.message

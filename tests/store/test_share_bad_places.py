@@ -231,14 +231,25 @@ def test_a_place_that_is_no_store(irl, tmp_path, place, code, words):
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("place", ["s3://", "s3:///", "memory://", "file://"])
-def test_a_url_of_nothing_is_no_directory(irl, store, chain, tmp_path, monkeypatch, place):
+@pytest.mark.parametrize(
+    ("place", "example"),
+    [
+        ("s3://", "s3://BUCKET/PATH"),
+        ("s3:///", "s3://BUCKET/PATH"),
+        ("memory://", "memory://BUCKET/PATH"),
+        ("file://", "file:///PATH"),
+    ],
+)
+def test_a_url_of_nothing_is_no_directory(irl, store, chain, tmp_path, monkeypatch, place, example):
     """`s3://$BUCKET` with an empty variable."""
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.iterdir())
     for line in (("push", "irm-0", "--to"), ("pull", "irm-0", "--from"), ("ls", "--from")):
         result = irl(*line, place, "--store", store.root)
         assert result.code == 2 and f"{place} names no bucket or path" in result.err, result.err
+        assert example in result.err
+    result = irl("push", "irm-0", "--to", place, "--store", tmp_path / "none")
+    assert result.code == 2 and example in result.err, result.err
     assert set(tmp_path.iterdir()) == before
 
 
