@@ -147,13 +147,13 @@ def _bounded(
         yield part
     if far:
         job.console.warn(
-            f"{far:,} of {total:,} steps have actions more than {_FAR} times as far out as their bounds: "
-            "check their units"
+            f"actions more than {_FAR} times as far out as their bounds: {far:,} of {total:,} steps; check "
+            "their units"
         )
     if outside:
         job.console.warn(
-            f"{outside:,} observations of {total:,} steps lie outside the environment's bounds: check "
-            "their units, and that they are not normalised"
+            f"observations outside the environment's bounds: {outside:,} in {total:,} steps; check their "
+            "units, and that they are not normalised"
         )
 
 

@@ -185,14 +185,14 @@ def test_observations_outside_the_environments_bounds_are_counted(
     assert "warning" not in irl("import", exported, *line).err
     done = irl("import", tmp_path / "other.parquet", *line)
     assert done.code == 0
-    outside = f"of {len(table)} steps lie outside the environment's bounds"
-    assert f"7 observations {outside}" in done.err
+    outside = f"outside the environment's bounds: {{}} in {len(table)} steps"
+    assert outside.format(7) in done.err
     # The last one of an episode, where its absorbing state is.
     following[np.flatnonzero(table["terminated"])[0], 0] = 250.0
     at = table.schema.get_field_index("next_obs")
     other = pa.FixedSizeListArray.from_arrays(pa.array(following.ravel()), 8)
     pq.write_table(table.set_column(at, "next_obs", other), tmp_path / "last.parquet")
-    assert f"8 observations {outside}" in irl("import", tmp_path / "last.parquet", *line).err
+    assert outside.format(8) in irl("import", tmp_path / "last.parquet", *line).err
 
 
 def test_an_end_where_no_episode_ends_is_warned_of(irl, tmp_path):
