@@ -17,7 +17,7 @@ class StageCheckpoints:
     Args:
         scratch: where the checkpoint lies.
         console: receives warnings.
-        seconds: least time between two checkpoints [s].
+        seconds: least time from the end of one checkpoint to the start of the next [s].
     """
 
     def __init__(self, scratch: Scratch, console: Console, seconds: float):
@@ -58,15 +58,15 @@ class StageCheckpoints:
         Raises:
             Interrupted: a stop was requested; the state has been saved.
         """
-        now = time.monotonic()
-        if self.stop_requested or now - self._last >= self._seconds:
+        if self.stop_requested or time.monotonic() - self._last >= self._seconds:
             header = provenance.Header(
                 schema=provenance.SCHEMA,
                 libraries=self._libraries,
                 attempts=self.attempts(),
             )
             self._scratch.save(header.encode(state()))
-            self._last = now
+            # After it: saving a large state can take longer than the interval.
+            self._last = time.monotonic()
         if self.stop_requested:
             raise Interrupted(
                 "stopped; a checkpoint was written", "run the same command again to resume"

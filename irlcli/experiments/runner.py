@@ -213,21 +213,22 @@ class Runner:
         self.console.start(request.label, checkpoints.load() is not None, record.key)
         output = scratch.new_output()
         job = Job(request.parameters, inputs, output, checkpoints, self.console, self.workers)
+        # To the end of publishing: a signal must not lose finished work.
         with stop_requests(checkpoints.request_stop):
             try:
                 request.stage.run(job)
+                command = provenance.by_id(self.command, self.store.resolved)
+                origin = provenance.record(command, self.workers, checkpoints.attempts())
+                environment = described(request)
+                if environment is not None:
+                    origin["environment"] = environment
+                origin["inputs"] = {role: _address(source) for role, source in sources.items()}
+                published = self.store.publish(record, output, origin)
             except BaseException as error:
                 scratch.discard_output(output)
                 if isinstance(error, StageFailed):
                     raise StageFailed(f"{request.label}: {error.message}", error.hint) from error
                 raise
-        command = provenance.by_id(self.command, self.store.resolved)
-        origin = provenance.record(command, self.workers, checkpoints.attempts())
-        environment = described(request)
-        if environment is not None:
-            origin["environment"] = environment
-        origin["inputs"] = {role: _address(source) for role, source in sources.items()}
-        published = self.store.publish(record, output, origin)
         if published.diverged is not None:
             self.console.warn(
                 f"{request.label} differs from {published.diverged.id}, the stored result of the same "

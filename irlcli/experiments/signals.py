@@ -38,9 +38,11 @@ def stop_requests(handle: Callable[[], None]) -> Iterator[None]:
         if first or again:
             handle()
 
+    # A shell lets a command in the background ignore SIGINT.
     previous = {
         number: signal.signal(number, receive)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
+        if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
         yield

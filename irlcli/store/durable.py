@@ -90,7 +90,8 @@ def remove_leftovers(directory: Path) -> None:
         except FileNotFoundError:
             continue
         if not alive(int(owner[1])) if owner[2] == machine() else old:
-            with suppress(PermissionError):
+            # Another process may remove it at the same time.
+            with suppress(PermissionError, FileNotFoundError):
                 remove(path)
 
 

@@ -221,19 +221,28 @@ def _remove(path: Path, token: str) -> None:
 
 @contextmanager
 def _beating(path: Path, token: str) -> Iterator[None]:
-    """Touch the lease of this process as long as it holds it. A forked child has no threads."""
+    """Touch the lease of this process as long as it holds it. A forked child has no threads.
+
+    It is created again if it is gone: the disk was full, or another process took this one for dead.
+    """
     ended = threading.Event()
 
     def beat() -> None:
         while not ended.wait(HEARTBEAT_SECONDS):
-            if _token(path) == token:
+            there = _token(path)
+            if there is None:
+                _create(path, token)
+            elif there == token:
                 with suppress(OSError):
                     os.utime(path, follow_symlinks=False)
 
-    threading.Thread(target=beat, daemon=True).start()
+    beating = threading.Thread(target=beat, daemon=True)
+    beating.start()
     try:
         yield
     finally:
         ended.set()
+        # Otherwise it might create the lease again.
+        beating.join()
         if _token(path) == token:
             path.unlink(missing_ok=True)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import signal
 from pathlib import Path
 
 import pytest
 from test_run import TABLES, Unseen
 
 from irlcli.experiments.cluster.job import StepJob
+from irlcli.experiments.cluster.records import Record
 from irlcli.experiments.cluster.resources import Resources
 from irlcli.experiments.cluster.slurm import Slurm
 from irlcli.experiments.cluster.submission import JobCommand, Submission
@@ -66,9 +69,13 @@ def planned(session, tmp_path, seeds="[0]"):
     return open_plan(session, TableChoice("tiny", tag="smoke", file=tables))
 
 
-def submit(session, plan, queue):
+def submission(session, plan, queue, display):
     command = JobCommand(lambda name: ["true"], Path.cwd(), 0, 1)
-    return Submission(plan, session.runner(), queue, command, Unseen()).submit()
+    return Submission(plan, session.runner(), queue, command, display)
+
+
+def submit(session, plan, queue):
+    return submission(session, plan, queue, Unseen()).submit()
 
 
 def test_each_job_waits_for_what_it_needs_and_is_submitted_once(session, tmp_path):
@@ -90,6 +97,51 @@ def test_what_others_make_while_the_probe_waits_is_not_submitted(session, tmp_pa
     assert submit(session, plan, queue) == len(plan.tasks) - 1
     assert name not in dict(queue.jobs.values())
     assert name in session.store.names()
+
+
+class Deaf(Told):
+    """The queue of this machine, with jobs that hear only the third request to end."""
+
+    starts_what_waits = False
+    asked = 0
+
+    def states(self):
+        return {} if self.asked > 2 else dict.fromkeys(self.jobs, "RUNNING")
+
+    def cancel(self, ids):
+        assert {*ids} == {*self.jobs}
+        self.asked += 1
+
+
+class StopAtOnce(Unseen):
+    """A display whose user presses Ctrl-C when the first job runs."""
+
+    def start(self, name):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_job_that_does_not_listen_yet_is_told_again_to_end(session, tmp_path):
+    plan, queue = planned(session, tmp_path), Deaf()
+    run = submission(session, plan, queue, StopAtOnce())
+    assert run.submit() == len(plan.tasks)
+    assert run.watch().interrupted and len(queue.jobs) == 1 and queue.asked == 3
+
+
+def test_jobs_that_cannot_be_recorded_are_cancelled(session, tmp_path, monkeypatch):
+    plan, cancelled = planned(session, tmp_path), []
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    class Noting(Told):
+        def cancel(self, ids):
+            cancelled.extend(ids)
+
+    monkeypatch.setattr(Record, "add", full)
+    queue = Noting()
+    with pytest.raises(OSError, match="No space left"):
+        submit(session, plan, queue)
+    assert cancelled == [*queue.jobs]
 
 
 def test_an_array_is_submitted_without_variables_that_sbatch_prefers_to_its_script(

@@ -12,7 +12,7 @@ import pytest
 
 from irlcli.errors import Busy
 from irlcli.store import Artefact, Store
-from irlcli.store.durable import machine
+from irlcli.store.durable import machine, remove_leftovers
 from irlcli.store.lease import Patience
 from irlcli.store.lock import exclusive, locked
 
@@ -254,6 +254,19 @@ def test_another_users_leftovers_are_left(empty_store, monkeypatch):
     assert [path.name for path in work] == ["ours"]
     assert len(said) == 1 and "theirs" in said[0]
     assert empty_store.has_checkpoint("theirs") and not empty_store.has_checkpoint("ours")
+
+
+def test_two_processes_may_remove_the_same_leftovers(tmp_path, monkeypatch):
+    (tmp_path / f"copy.999999999.{'0' * 32}.{machine()}").mkdir()
+    remove = shutil.rmtree
+
+    def rmtree(path, *arguments, **options):
+        for _ in range(2):
+            remove(path, *arguments, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", rmtree)
+    remove_leftovers(tmp_path)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_locks_of_a_group_can_be_taken_by_its_members(tmp_path):

@@ -102,6 +102,20 @@ def test_a_lease_is_kept_alive(empty_store, leases, monkeypatch):
         assert lease.read(path).lives(locks_work=False)
 
 
+def test_a_lease_that_is_gone_is_created_again(empty_store, leases, monkeypatch):
+    """The disk was full when it was created, or another machine took its holder for dead."""
+    monkeypatch.setattr(lease, "HEARTBEAT_SECONDS", 0.02)
+    with empty_store.working_on(KEY, wait=False):
+        path = leases / f"{KEY}.claim"
+        path.unlink()
+        limit = time.monotonic() + 10
+        while lease.read(path) is None and time.monotonic() < limit:
+            time.sleep(0.01)
+        assert lease.read(path).process == os.getpid()
+    time.sleep(0.1)
+    assert lease.read(path) is None
+
+
 def test_the_clock_of_a_machine_does_not_matter(empty_store, leases, monkeypatch):
     path = foreign(leases / f"{KEY}.claim")
     ahead = time.time() + 10 * lease.STALE_SECONDS

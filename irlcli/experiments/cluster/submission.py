@@ -170,8 +170,9 @@ class Submission:
         self._display.stopping("to leave without waiting")
         own = [name for name in self._alive if self._records[name] is self._record]
         ids = {self._ids[name] for name in own}
-        self._queue.cancel(ids)
+        # A job that has just started does not listen yet, so it is told until it has ended.
         while self._signals < 2 and not ids.isdisjoint(self._queue.states()):
+            self._queue.cancel(ids)
             time.sleep(0.5)
         self._plan.lookup.forget_missing()
         for name in own:
@@ -233,7 +234,12 @@ class Submission:
         ]
         for step in submitted:
             self._ids[step.name], self._records[step.name] = step.job, self._record
-        self._record.add(submitted)
+        try:
+            self._record.add(submitted)
+        except BaseException:
+            # Nobody would find them again.
+            self._queue.cancel(ids)
+            raise
 
     def _ready(self, name: str) -> bool:
         return all(self._exists(need) for need in self._plan.needs[name])
