@@ -228,7 +228,7 @@ def comparison(
             f"{row}: settings to train in: {len(trained)}, held out: {len(unseen)}",
             "a row needs at least one to train in and exactly one held out",
         )
-    yield from requests.expert_tasks([*trained, *unseen])
+    yield from requests.expert_tasks([*trained, *(unseen if has_held_out(measures) else ())])
     demos = collect_experts.request(row.env, trained, requests.config, 0, requests.listed.episodes)
     yield Task(f"{row}.demos", "demos", demos)
     yield from _without_reward(requests, measures)
@@ -243,15 +243,19 @@ def comparison(
 
 
 def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator[Task]:
-    """What the experts, the random and the idle agent earn."""
+    """What the experts, the random and the idle agent earn.
+
+    The held-out setting and its expert belong to a table only if a measure is taken there.
+    """
     row, trained, unseen = requests.row, requests.trained, requests.unseen
-    setting = str(unseen[0])
-    for agent in ("random", "idle"):
-        cell = requests.cell(agent, "ood", place=setting)
-        request = requests.returns(unseen, None, agent)
-        yield Task(f"{row}.{agent}-returns", "returns", request, cell)
-    name, request = requests.own_returns(unseen[0])
-    yield Task(name, "returns", request, requests.cell("expert", "ood", place=setting))
+    held_out, setting = has_held_out(measures), str(unseen[0])
+    if held_out:
+        for agent in ("random", "idle"):
+            cell = requests.cell(agent, "ood", place=setting)
+            request = requests.returns(unseen, None, agent)
+            yield Task(f"{row}.{agent}-returns", "returns", request, cell)
+        name, request = requests.own_returns(unseen[0])
+        yield Task(name, "returns", request, requests.cell("expert", "ood", place=setting))
     in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
     for e in trained:
         expert, label = requests.expert(e), f"expert of {e}"
@@ -261,7 +265,7 @@ def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         reused = (("ood", unseen), ("id", trained)) if expert != requests.expert(unseen[0]) else ()
         for measure, settings in reused:
-            if measure == "ood" or in_distribution:
+            if held_out if measure == "ood" else in_distribution:
                 name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
                 request = requests.returns(settings, expert, policy_label=label)
                 cell = requests.cell("reused", measure, place=str(e))

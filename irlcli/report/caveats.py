@@ -63,8 +63,8 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
             share = "" if least is pd.NA else f" ({least:.1%} of its return)"
             found.append(
                 f"Not imitated: {r.row}, {title(r.agent)}: in a training setting the student earns over a "
-                f"fifth less than the expert{share}, in the mean over seeds. Do not interpret gaps to other "
-                "methods."
+                f"fifth less than the expert{share}, in the mean over seeds. Do not interpret gaps to "
+                "others."
             )
     return found
 

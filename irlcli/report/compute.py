@@ -213,7 +213,8 @@ def _by_setting(points: pd.DataFrame, row: str, agent: str, measure: str) -> pd.
 def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) -> pd.DataFrame:
     """A row per row, measure and pair of methods (x, y), over seeds with every evaluation.
 
-    Columns: ``row``, ``measure``, ``x``, ``y``; ``difference`` of the means, ``low`` and ``high``, its
+    Pairs that share all runs of a measure are left out. Columns: ``row``, ``measure``, ``x``, ``y``;
+    ``difference`` of the means, ``low`` and ``high``, its
     95 % interval by Welch's test, and the ``detectable`` difference; two-sided p-values
     ``p_welch`` (primary), ``p_welch_holm`` (over the rows, in an ablation over the rows and
     variants), ``p_paired`` (over the ``pairs`` seeds that both methods have), ``p_student`` and
@@ -228,7 +229,13 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     found = []
     for measure in p.measures:
         for family in families:
-            tests = [(x, y, row) for x, y in family for row in p.rows]
+            # A variant may share the runs of its base.
+            tests = [
+                (x, y, row)
+                for x, y in family
+                for row in p.rows
+                if not _same_runs(p, row.name, x, y, measure)
+            ]
             samples = [
                 [
                     whole_sample(p, points, row.name, agent, measure)["true_return"]
@@ -268,6 +275,12 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     columns += ["p_welch_holm", "p_paired", "pairs", "p_student", "p_rank", "improvement"]
     columns += ["not_imitated", "why"]
     return pd.DataFrame(found, columns=columns)
+
+
+def _same_runs(p: Parameters, row: str, x: str, y: str, measure: str) -> bool:
+    """Whether ``x`` and ``y`` have the same evaluations, so that there is nothing to compare."""
+    of_x, of_y = ({cell.run for cell in p.cells_of(row, agent, measure)} for agent in (x, y))
+    return bool(of_x) and of_x == of_y != {None}
 
 
 def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:

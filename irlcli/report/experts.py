@@ -19,8 +19,8 @@ from irlcli.report.tables import Table, markdown_table
 
 _TITLE = "Experts: true return in their own settings"
 _NOTE = (
-    f"Mean true return of whole episodes ± standard deviation over episodes. {PROGRESS} A robot that "
-    "stands still is rewarded for being alive. Random and idle agents learn nothing. Time: of one "
+    f"Mean true return of whole episodes ± standard deviation over episodes. {PROGRESS} Robots "
+    "that can fall are rewarded for being alive, even if they stand still. Random and idle agents learn nothing. Time: of one "
     "process on a machine shared with other runs; its first run includes loading the libraries."
 )
 _USES = {"id": "trained in", "ood": "held out"}
@@ -174,4 +174,4 @@ def _value(place: Any, name: str) -> float | None:
 
 
 def _text(value: Any) -> str:
-    return "-" if pd.isna(value) else f"{value:,.0f}"
+    return "-" if pd.isna(value) else f"{value:z,.0f}"

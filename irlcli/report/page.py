@@ -22,7 +22,10 @@ _VARIANT_FILES = "`variants.csv`: a row per variant. `shares.csv`: shares of the
 def latex(report: Report) -> str:
     """Every table; the caveats and what stands above them are comments."""
     comments = "".join(f"% {line}\n" for line in (*report.in_short, *report.caveats))
-    tables = [latex_table(t.columns, t.rows, f"{t.title}. {t.note}".strip()) for t in report.tables]
+    tables = [
+        latex_table(t.columns, t.rows, f"{t.title}. {_plain(t.note)}".strip())
+        for t in report.tables
+    ]
     return f"% Needs \\usepackage{{booktabs,longtable}}.\n{comments}\n" + "\n".join(tables)
 
 
@@ -47,6 +50,11 @@ def markdown(p: Parameters, report: Report) -> str:
         f"`.pdf`: {(_SHARES if p.variants else _RETURNS).lower()}\n"
     )
     return "\n".join(parts)
+
+
+def _plain(note: str) -> str:
+    """``note`` without Markdown's emphasis and code."""
+    return note.replace("*", "").replace("`", "")
 
 
 def _made(p: Parameters) -> str:
@@ -170,7 +178,7 @@ def _html_table(table: Table) -> str:
     # Focusable, so that the keyboard can scroll a table that is wider than the page.
     return (
         f'<div class="wide" tabindex="0" role="region" aria-label="{escape(table.title)}"><table>'
-        f"<caption>{escape(table.note or table.title)}</caption><thead><tr>{head}</tr></thead>"
+        f"<caption>{escape(_plain(table.note) or table.title)}</caption><thead><tr>{head}</tr></thead>"
         f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
 

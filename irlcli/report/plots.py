@@ -84,7 +84,9 @@ def _figure(p: Parameters, report: Report) -> Figure:
 
 def _points(p: Parameters, report: Report) -> Figure:
     measures = [m for m in p.measures if m != "id"] or ["id"]
-    size = (0.6 + 3.2 * len(p.rows), 0.5 + 2.7 * len(measures))
+    # The names of many methods need a wider panel.
+    width = max(3.2, 0.8 * len(p.methods))
+    size = (0.6 + width * len(p.rows), 0.5 + 2.7 * len(measures))
     figure, axes = panels(len(measures), len(p.rows), size)
     for line, measure in zip(axes, measures, strict=True):
         for axis, row in zip(line, p.rows, strict=True):

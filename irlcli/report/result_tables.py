@@ -31,12 +31,12 @@ _TEST_NOTE = (
 )
 # Patterns of cells, and what to say below a table that has such a cell.
 _MARKS = {
-    r"\(\d+/\d+\)": "(3/5): three of five seeds exist.",
+    r"\(\d+/\d+\)": "(n/m): n of m seeds exist.",
     r"\(part\)": "(part): some evaluations are missing; differences and p-values leave their seeds out.",
     "†": "† in a training setting the student earns over a fifth less than the expert.",
     "‡": "‡ runs of more than one commit or set of libraries.",
     "^progress$": PROGRESS,
-    "^ant ": "An idle ant earns about 600.",
+    "^ant ": "An idle ant earns 600 to 675.",
 }
 _RETRAININGS_NOTE = (
     "Each reward was retrained {} times: the return of a seed is their mean, and ± is over seeds. "

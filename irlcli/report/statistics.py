@@ -121,14 +121,14 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
     """``x`` [n] against ``y`` [m]."""
     a, b = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if not len(a) or not len(b):
-        return Comparison(why="one of the two methods has no seed")
+        return Comparison(why="one of the two has no seed")
     found = Comparison(float(a.mean() - b.mean()))
     if min(len(a), len(b)) == 1:
-        return replace(found, why="one seed has no variance; each method needs two")
+        return replace(found, why="one seed has no variance; each of the two needs two")
     rank, improvement = rank_test(a, b)
     found = replace(found, rank=rank, improvement=improvement)
     if not np.ptp(a) and not np.ptp(b):
-        return replace(found, why="each method's seeds are equal, so the variance is zero")
+        return replace(found, why="the seeds of each are equal, so the variance is zero")
     # scipy warns if one sample is constant. The tests are defined all the same.
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         welch, student = (stats.ttest_ind(a, b, equal_var=v) for v in (False, True))

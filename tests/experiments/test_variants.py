@@ -65,7 +65,10 @@ def test_variants_share_what_they_do_not_change(plan):
         assert f"{ROW}.full.erm.0" in steps[f"low-ceiling.erm.0.transfer-id.{value}"]["needs"]
     assert not any(name.startswith("no-ceiling.") for name in steps)
     # Experts and demonstrations are the same for all.
-    assert {"demos", "expert.1x", "expert.1.25x", "random-returns"} <= set(steps)
+    assert {"demos", "expert.1x", "expert.1.25x"} <= set(steps)
+    # No measure of the table is taken in the held-out setting.
+    held_out = {"expert.1.5x", "expert-returns", "random-returns", "expert.1x.reused-returns"}
+    assert held_out.isdisjoint(steps)
 
 
 def test_a_space_before_a_field_changes_nothing(plan, tmp_path):

@@ -17,15 +17,22 @@ FIRST, SECOND = "bounce=0.1", "bounce=0.5"
 EXPERTS = {FIRST: (200.0, 50.0), SECOND: (100.0, 20.0)}
 
 
-def ablation(returns, experts=EXPERTS, method="erm"):
+def ablation(returns, experts=EXPERTS, method="erm", shared=()):
     """The report; ``returns`` maps (variant, measure, setting) to a return for each seed.
 
-    In place of a return there may be a list: one for each retraining.
+    In place of a return there may be a list: one for each retraining. The variants and measures
+    of ``shared`` have the runs of "full".
     """
-    points, cells = [], []
+    points, cells, runs = [], [], {}
 
     def add(agent, measure, setting, seed, value, progress, retraining=0):
-        run = "" if value is None else f"{len(cells):016x}"
+        owner = "full" if (agent, measure) in shared else agent
+        own = f"{len(cells):016x}"
+        run = (
+            ""
+            if value is None
+            else runs.setdefault((owner, measure, setting, seed, retraining), own)
+        )
         why = "" if run else "no result of transfer"
         place = setting if measure == "transfer-id" else ""
         cells.append(Cell(BOUNCE, agent, measure, seed, place, run, why, retraining))
@@ -57,6 +64,14 @@ def ablation(returns, experts=EXPERTS, method="erm"):
         others=(),
     )
     return build(p, pd.DataFrame(points), {}, {})
+
+
+def test_a_variant_is_not_compared_on_runs_that_it_shares():
+    found = ablation(RETURNS, shared={("no ceiling", "id")}).comparisons
+    assert set(found[found["measure"] == "id"]["x"]) == {"no challengers"}
+    assert set(found[found["measure"] == "transfer-id"]["x"]) == {"no ceiling", "no challengers"}
+    assert set(ablation(RETURNS).comparisons["x"]) == {"no ceiling", "no challengers"}
+    assert len(ablation(RETURNS).comparisons) == 4
 
 
 RETURNS = {
