@@ -256,20 +256,22 @@ def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator
             yield Task(f"{row}.{agent}-returns", "returns", request, cell)
         name, request = requests.own_returns(unseen[0])
         yield Task(name, "returns", request, requests.cell("expert", "ood", place=setting))
+    places = {"ood": unseen} if held_out else {}
     in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
+    if in_distribution:
+        places["id"] = trained
     for e in trained:
         expert, label = requests.expert(e), f"expert of {e}"
         if in_distribution:
             name, request = requests.own_returns(e)
             yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
-        reused = (("ood", unseen), ("id", trained)) if expert != requests.expert(unseen[0]) else ()
-        for measure, settings in reused:
-            if held_out if measure == "ood" else in_distribution:
-                name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
-                request = requests.returns(settings, expert, policy_label=label)
-                cell = requests.cell("reused", measure, place=str(e))
-                yield Task(name, "returns", request, cell)
+        if expert == requests.expert(unseen[0]):
+            continue
+        for measure, settings in places.items():
+            name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
+            request = requests.returns(settings, expert, policy_label=label)
+            yield Task(name, "returns", request, requests.cell("reused", measure, place=str(e)))
 
 
 def _run(

@@ -214,9 +214,8 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
     """A row per row, measure and pair of methods (x, y), over seeds with every evaluation.
 
     Pairs that share all runs of a measure are left out. Columns: ``row``, ``measure``, ``x``, ``y``;
-    ``difference`` of the means, ``low`` and ``high``, its
-    95 % interval by Welch's test, and the ``detectable`` difference; two-sided p-values
-    ``p_welch`` (primary), ``p_welch_holm`` (over the rows, in an ablation over the rows and
+    ``difference`` of the means, ``low`` and ``high``, its 95 % interval by Welch's test, and the
+    ``detectable`` difference; two-sided p-values ``p_welch`` (primary), ``p_welch_holm`` (over the rows, in an ablation over the rows and
     variants), ``p_paired`` (over the ``pairs`` seeds that both methods have), ``p_student`` and
     ``p_rank`` (Mann-Whitney); ``improvement``, the probability that a seed of x beats one of y;
     ``not_imitated``, which of the two failed in distribution; ``why``, the reason for a missing

@@ -19,9 +19,10 @@ from irlcli.report.tables import Table, markdown_table
 
 _TITLE = "Experts: true return in their own settings"
 _NOTE = (
-    f"Mean true return of whole episodes ± standard deviation over episodes. {PROGRESS} Robots "
-    "that can fall are rewarded for being alive, even if they stand still. Random and idle agents learn nothing. Time: of one "
-    "process on a machine shared with other runs; its first run includes loading the libraries."
+    f"Mean true return of whole episodes ± standard deviation over episodes. {PROGRESS} Robots that can "
+    "fall are rewarded for being alive, even if they stand still. Random and idle agents learn nothing. "
+    "Time: of one process on a machine shared with other runs; its first run includes loading the "
+    "libraries."
 )
 _USES = {"id": "trained in", "ood": "held out"}
 

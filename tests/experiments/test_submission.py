@@ -113,18 +113,24 @@ class Deaf(Told):
         self.asked += 1
 
 
-class StopAtOnce(Unseen):
-    """A display whose user presses Ctrl-C when the first job runs."""
+class Impatient(Unseen):
+    """A display whose user presses Ctrl-C when the first job runs, ``times`` times."""
+
+    def __init__(self, times):
+        self.times = times
 
     def start(self, name):
-        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(self.times):
+            os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_a_job_that_does_not_listen_yet_is_told_again_to_end(session, tmp_path):
+@pytest.mark.parametrize(("times", "asked"), [(1, 3), (2, 1)])
+def test_a_job_that_does_not_listen_yet_is_told_again_to_end(session, tmp_path, times, asked):
+    """A second Ctrl-C ends the wait, not the request."""
     plan, queue = planned(session, tmp_path), Deaf()
-    run = submission(session, plan, queue, StopAtOnce())
+    run = submission(session, plan, queue, Impatient(times))
     assert run.submit() == len(plan.tasks)
-    assert run.watch().interrupted and len(queue.jobs) == 1 and queue.asked == 3
+    assert run.watch().interrupted and len(queue.jobs) == 1 and queue.asked == asked
 
 
 def test_jobs_that_cannot_be_recorded_are_cancelled(session, tmp_path, monkeypatch):

@@ -170,10 +170,11 @@ class Submission:
         self._display.stopping("to leave without waiting")
         own = [name for name in self._alive if self._records[name] is self._record]
         ids = {self._ids[name] for name in own}
-        # A job that has just started does not listen yet, so it is told until it has ended.
+        self._queue.cancel(ids)
         while self._signals < 2 and not ids.isdisjoint(self._queue.states()):
-            self._queue.cancel(ids)
             time.sleep(0.5)
+            # A job that had just started did not listen yet.
+            self._queue.cancel(ids)
         self._plan.lookup.forget_missing()
         for name in own:
             self._ended(name, last=False)
