@@ -239,7 +239,10 @@ def comparison(
                 under[run.config_of] = _RowRequests(row, run.config_of)
             yield from _run(under[run.config_of], demos, run, measures, retrainings, chosen)
         except UsageError as error:
-            raise UsageError(f"{row}, {run.agent}: {error.message}", error.hint) from None
+            hint = error.hint
+            if run.config_of is not config_of:
+                hint += "; a variant's own values win over --set"
+            raise UsageError(f"{row}, {run.agent}: {error.message}", hint) from None
 
 
 def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator[Task]:

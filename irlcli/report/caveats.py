@@ -96,7 +96,7 @@ def weak_experts(
         others = _earned_in(row.unseen, points[points["row"] == row.name], p.methods)
         better = {} if expert is None else others[others > expert].to_dict()
         if better:
-            listed = ", ".join(f"{agents} ({earned:.1f})" for agents, earned in better.items())
+            listed = " and ".join(f"{agents} ({earned:.1f})" for agents, earned in better.items())
             found.append(
                 f"Weak expert: {row.name}: in {row.unseen} its own expert earns {expert:.1f}, less than "
                 f"{listed}. It may not be the best policy known."

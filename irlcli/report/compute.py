@@ -35,7 +35,7 @@ import pandas as pd
 from irlcli.data.descriptions import Assessment, Interval, Measured
 from irlcli.report.agents import BASELINES, IN_DISTRIBUTION, comparisons
 from irlcli.report.lineage import is_mixed, origins
-from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters
+from irlcli.report.parameters import EXPERT_BY_REWARD, Parameters, has_held_out
 from irlcli.report.reward_quality import Judgement, judge
 from irlcli.report.statistics import compare, holm, paired_p, summarise
 
@@ -138,7 +138,7 @@ def summarise_cells(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """
     found = []
     for row in p.rows:
-        wanted = [(agent, "ood") for agent in BASELINES]
+        wanted = [(agent, "ood") for agent in BASELINES if has_held_out(p.measures)]
         if not set(IN_DISTRIBUTION).isdisjoint(p.measures):
             wanted += [("expert", "id"), ("reused", "id")]
         wanted += [(method, m) for m in p.measures for method in p.methods]

@@ -63,7 +63,7 @@ def test_every_method_whose_policies_beat_an_expert_is_named():
     earned = {(BOUNCE, "erm", "transfer"): [260.0] * 3, (BOUNCE, "irm", "transfer"): [255.0] * 3}
     found = build(*example(complete() | earned), {}, {}).caveats
     (named,) = (c for c in found if c.startswith("Weak expert"))
-    assert "AIRL-ERM's transfer policies (260.0), AIRL-IRM's transfer policies (255.0)" in named
+    assert "AIRL-ERM's transfer policies (260.0) and AIRL-IRM's transfer policies (255.0)" in named
 
 
 def test_an_expert_below_a_variants_policies_is_named():
