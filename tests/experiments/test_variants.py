@@ -184,7 +184,7 @@ def test_contradictory_options_name_the_variant(irl, tmp_path):
     line = ["--experiments", path, "--profile", "smoke", "--store", tmp_path / "none"]
     refused = irl("plan", "parts", *line)
     assert refused.code == 2 and ", gradient penalty: airl.challenger.life" in refused.err
-    assert len(refused.err.splitlines()) == 2
+    assert len(refused.err.splitlines()) == 2 and "own values win over --set" in refused.err
     several = irl("plan", "parts", *line, "--methods", "erm,irm")
     assert several.code == 2 and "--methods: variants" in several.err
     chosen = irl("plan", "parts", *line, "--choose-penalty", "1,2")
