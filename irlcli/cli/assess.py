@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from irlcli.cli import console as out
-from irlcli.cli.options import Env, Name, OneSetting, Seed, stage_command
+from irlcli.cli.options import EachSetting, Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.data.descriptions import Assessed, Assessment, Interval, Measured, RegretSplit
 from irlcli.experiments import references
@@ -28,7 +28,7 @@ def assess(
             "reward was learned."
         ),
     ] = None,
-    setting: OneSetting = [],  # noqa: B006
+    setting: EachSetting = [],  # noqa: B006
     demos: Annotated[
         str | None,
         typer.Option(

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from irlcli.cli.demonstrations import deliver_demonstrations
-from irlcli.cli.options import MAX_SEED, Name, OneSetting, RequiredEnv, stage_command
+from irlcli.cli.options import MAX_SEED, EachSetting, Name, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests import collect as requested
 
@@ -20,7 +20,7 @@ def collect_experts(
             help="KNOB=VALUE,VALUE, or KNOB for its training values in the settings file."
         ),
     ] = None,
-    setting: OneSetting = [],  # noqa: B006
+    setting: EachSetting = [],  # noqa: B006
     expert: Annotated[
         list[str],
         typer.Option(

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from irlcli.cli import returns
-from irlcli.cli.options import Env, Name, OneSetting, Seed, stage_command
+from irlcli.cli.options import EachSetting, Env, Name, Seed, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.report.returns import as_json
 from irlcli.requests import evaluate as requested
@@ -40,7 +40,7 @@ def evaluate(
     intervention: Annotated[
         str | None, typer.Option(help="Settings: KNOB=VALUE,..., or KNOB (training values).")
     ] = None,
-    setting: OneSetting = [],  # noqa: B006
+    setting: EachSetting = [],  # noqa: B006
     env: Env = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes per setting.")] = None,
     seed: Seed = 0,

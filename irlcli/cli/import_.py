@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from irlcli.cli.demonstrations import deliver_demonstrations
-from irlcli.cli.options import Name, OneSetting, RequiredEnv, stage_command
+from irlcli.cli.options import EachSetting, Name, RequiredEnv, stage_command
 from irlcli.cli.session import StageSession
 from irlcli.requests.collect import import_demonstrations
 
@@ -29,7 +29,7 @@ def import_(
             "settings file."
         ),
     ] = None,
-    setting: OneSetting = [],  # noqa: B006
+    setting: EachSetting = [],  # noqa: B006
     setting_column: Annotated[
         str | None,
         typer.Option(

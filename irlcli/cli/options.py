@@ -26,11 +26,10 @@ _ENV = typer.Option(
 )
 Env = Annotated[str | None, _ENV]
 RequiredEnv = Annotated[str, _ENV]
-OneSetting = Annotated[
-    list[str],
-    typer.Option(
-        "--setting", help="One setting, also of several knobs: KNOB=VALUE,KNOB=VALUE. Repeatable."
-    ),
+_SETTING = "KNOB=VALUE, or of several knobs KNOB=VALUE,KNOB=VALUE."
+OneSetting = Annotated[list[str], typer.Option("--setting", help=f"Setting: {_SETTING}")]
+EachSetting = Annotated[
+    list[str], typer.Option("--setting", help=f"One setting: {_SETTING} Repeatable.")
 ]
 
 

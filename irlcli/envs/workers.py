@@ -100,7 +100,7 @@ def _work(
     """
     # Ctrl-C, `timeout` and schedulers signal the whole process group; the parent decides how to
     # react, and a worker ends when its pipe does.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR2):
         signal.signal(number, signal.SIG_IGN)
     actions, observations, rewards = (view[worker::workers] for view in shared.views())
     try:

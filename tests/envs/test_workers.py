@@ -19,6 +19,7 @@ from mujoco_robots import HalfCheetah
 from irlcli.envs.vector import VectorWorlds
 from irlcli.envs.workers import WorkerFailed, WorkerWorlds
 from irlcli.errors import StageFailed
+from irlcli.experiments.signals import STOPPING
 
 SEEDS = [3, 1, 4]
 FACTORIES = [
@@ -249,7 +250,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR2])
+@pytest.mark.parametrize("stop", STOPPING)
 def test_a_signal_to_the_whole_group_leaves_the_workers_to_the_parent(stop):
     worlds = WorkerWorlds([Fragile] * 2, max_episode_steps=100, workers=2)
     try:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import subprocess
+import sys
 
 import msgspec
 import pytest
@@ -12,7 +14,7 @@ import pytest
 from irlcli.errors import Interrupted
 from irlcli.experiments import checkpoints
 from irlcli.experiments.runner import Runner, Silent
-from irlcli.experiments.signals import stop_requests
+from irlcli.experiments.signals import STOPPING, stop_requests
 from irlcli.stages.base import Request, Stage
 from irlcli.store import Store
 
@@ -25,7 +27,7 @@ def one_line(job):
     (job.output / "text").write_text("done\n")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR2])
+@pytest.mark.parametrize("number", STOPPING)
 def test_a_signal_while_an_artefact_is_published_loses_no_work(tmp_path, monkeypatch, number):
     publish = Store.publish
 
@@ -83,3 +85,32 @@ def test_a_signal_that_the_shell_ignores_stays_ignored():
         assert asked == ["stop"] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+WORK_IN_A_TERMINAL = """
+import sys
+from irlcli.experiments.signals import stop_requested, stop_requests
+
+with stop_requests(lambda: print("asked to stop", file=sys.stderr, flush=True)):
+    print("at work", flush=True)
+    while not stop_requested():
+        pass
+    print("the checkpoint is written", flush=True)
+    open(sys.argv[1], "w").write("whole")
+"""
+
+
+def test_work_ends_in_order_after_its_terminal_has_closed(tmp_path):
+    terminal, end = os.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", WORK_IN_A_TERMINAL, str(tmp_path / "checkpoint")],
+        stdout=end,
+        stderr=end,
+        start_new_session=True,
+    )
+    os.close(end)
+    assert b"at work" in os.read(terminal, 100)
+    os.close(terminal)
+    process.send_signal(signal.SIGHUP)
+    assert process.wait(timeout=60) == 0
+    assert (tmp_path / "checkpoint").read_text() == "whole"
