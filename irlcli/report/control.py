@@ -203,7 +203,7 @@ def _chosen(cells: _Cells, chosen: pd.DataFrame, strengths: Sequence[Sequence[fl
 def draw(directory: Path, summarised: pd.DataFrame) -> None:
     """Write ``control.png`` and ``control.pdf``: against lambda, settings and gap."""
     with matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "pdf.fonttype": 42}):
-        figure, axes = panels(2, 2, (11, 8))
+        figure, axes = panels(2, 2, (11, 9.5))
         for axis, measure, title in (
             (axes[0, 0], "pays_colour", "weight of the colour in the reward (learned features)"),
             (axes[0, 1], "quality", "quality visited in the unseen setting (learned features)"),
@@ -227,7 +227,14 @@ def draw(directory: Path, summarised: pd.DataFrame) -> None:
         for axis in axes.flat[1:]:
             axis.axhline(0.5, color="0.7", lw=0.8, zorder=0)
         for axis in axes.flat:
-            axis.legend(fontsize=7, framealpha=0.6, loc="best")
+            # Below the panel: lines and bands fill its corners.
+            axis.legend(
+                fontsize=8,
+                frameon=False,
+                loc="upper center",
+                bbox_to_anchor=(0.5, -0.13),
+                ncols=2,
+            )
         save(figure, directory, "control")
 
 

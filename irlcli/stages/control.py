@@ -62,4 +62,4 @@ def run(job: Job) -> None:
     (job.output / "README.md").write_text(page, encoding="utf-8")
 
 
-STAGE = Stage("control", 3, run)
+STAGE = Stage("control", 4, run)
