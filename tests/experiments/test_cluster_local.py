@@ -180,11 +180,12 @@ def test_a_step_that_was_made_meanwhile_is_not_started(runs, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_submission_keeps_what_others_recorded(runs, tmp_path):
+def test_a_submission_keeps_what_others_recorded(runs, smoke_store, tmp_path):
     """The logs and the failures of jobs that have ended, and a record that has no job yet."""
     store = tmp_path / "runs"
     line = (store, "--cluster", "local", "--jobs", "4")
-    runs.run(*line, *REWARDS, code=1, IRL_TEST_FAIL="train_airl pooled")
+    there = ("--from", smoke_store.path)
+    runs.run(*line, *REWARDS, *there, code=1, IRL_TEST_FAIL="train_airl pooled")
     empty = new_record(Store(store), f"local on {os.uname().nodename}")
     runs.run(*line, "--tag", "other", "--until", "experts", "--set", "expert.total_steps=999")
     assert empty.logs.is_dir()
@@ -251,10 +252,11 @@ def test_a_signal_is_heard_while_another_command_submits(runs, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_failure_is_shown_for_its_own_request_only(runs, tmp_path):
+def test_a_failure_is_shown_for_its_own_request_only(runs, smoke_store, tmp_path):
     store = tmp_path / "runs"
     line = (store, "--cluster", "local", "--jobs", "4", *REWARDS)
-    runs.run(*line, code=1, IRL_TEST_FAIL="train_airl pooled")
+    there = ("--from", smoke_store.path)
+    runs.run(*line, *there, code=1, IRL_TEST_FAIL="train_airl pooled")
 
     def states(*more):
         shown = runs.start(*line[:3], *REWARDS, "--status", "--json", *more).communicate()[0]
