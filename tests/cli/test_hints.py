@@ -437,8 +437,8 @@ def test_what_only_a_policy_from_the_student_reads_is_named(irl, smoke_store, st
 
 def test_what_the_choice_of_lambda_reads_is_read(irl, store_copy):
     line = ["train-airl", "--demos", "demos", "--method", "irm", "--choose-penalty", "0.1,1"]
-    item = "evaluation.episodes=2"
-    done = irl(*line, "--set", item, *SMOKE, "--store", store_copy.path)
+    items = ["--set", "evaluation.episodes=2", "--set", "airl.total_steps=2048"]
+    done = irl(*line, *items, *SMOKE, "--store", store_copy.path)
     assert done.code == 0 and "reads --set" not in done.err
 
 
