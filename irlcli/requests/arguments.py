@@ -398,3 +398,19 @@ def warn_of_weight(console: "RunConsole", name: str, config: "AIRLConfig | MaxEn
     """Warn if lambda is 0, which turns off the penalty that ``name`` is called after."""
     if config.penalty != "none" and config.penalty_weight == 0:
         console.warn(f"lambda is 0: {name} learns without its penalty, {config.penalty}")
+
+
+def warn_of_scale(console: "RunConsole", penalty: str, weight: float) -> None:
+    """Warn if AIRL's lambda, meant for another penalty, does not suit ``penalty``.
+
+    Lambda means another thing in each penalty, and settings files hold one value.
+    """
+    from irlcli.penalties import PENALTIES
+
+    suited = PENALTIES[penalty].candidates
+    own = suited != PENALTIES["irmv1"].candidates
+    if own and weight > 0 and not suited[0] <= weight <= suited[-1]:
+        console.warn(
+            f"lambda {weight:g} is outside the range of {penalty}, {suited[0]:g} to {suited[-1]:g}: "
+            "set it, or choose it with --choose-penalty own"
+        )

@@ -147,6 +147,11 @@ def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] 
     selection = Selection(tag, candidates, until, choice.only, listing)
     plan = Plan(table, selection, session.config, session.runner().lookup())
     _check_weights(session, table)
+    if choice.only is None and not candidates and not arguments.weights_set(session.overrides):
+        requests = [task.request for task in plan.tasks.values()]
+        learned = [r.parameters.airl for r in requests if r.stage.name == "train-airl"]
+        for penalty, weight in sorted({(airl.penalty, airl.penalty_weight) for airl in learned}):
+            arguments.warn_of_scale(session.console, penalty, weight)
     if choice.only is None and session.asked:
         # The processes that make one step each would repeat it. Later phases may read what the
         # first ones do not.

@@ -73,6 +73,10 @@ def train_airl(
     airl = config.airl_of(settings)
     arguments.check_weighted(airl_stage.method_of(airl), METHODS, airl.penalty, penalty_weight)
     arguments.warn_of_weight(session.console, airl_stage.method_of(airl), airl)
+    if (penalty_weight, choose_penalty) == (None, None) and not arguments.weights_set(
+        session.overrides
+    ):
+        arguments.warn_of_scale(session.console, airl.penalty, airl.penalty_weight)
     basis: dict[str, Source] = {}
     if choose_penalty is not None:
         # A bad option must fail before the choice of lambda, which takes long.

@@ -533,3 +533,37 @@ def test_inputs_from_the_smoke_profile_are_named(irl, smoke_store, line):
     words = [*line.split(), "--dry-run", "--store", smoke_store.path]
     assert "was made with --profile smoke" in irl(*words).err
     assert "was made with" not in irl(*words, *SMOKE).err
+
+
+@pytest.mark.parametrize(
+    ("words", "warned"),
+    [
+        (["--method", "l2"], True),
+        (["--method", "l2", "--penalty-weight", "1"], False),
+        (["--method", "l2", "--set", "airl.penalty_weight=1"], False),
+        (["--method", "l2", "--choose-penalty", "own"], False),
+        (["--method", "input-gradient"], False),
+        (["--method", "vrex"], False),
+    ],
+)
+def test_a_lambda_meant_for_another_penalty_is_named(irl, smoke_store, words, warned):
+    """The settings' lambda of 1 suits irmv1. Candidates of l2 end at 0.01."""
+    line = ["train-airl", "--demos", "demos", *words, "--dry-run", *SMOKE]
+    done = irl(*line, "--store", smoke_store.path)
+    assert done.code == 0 and ("lambda 1 is outside the range of l2" in done.err) == warned
+
+
+@pytest.mark.parametrize(("words", "warned"), [([], True), (["--choose-penalty", "own"], False)])
+def test_a_table_names_a_lambda_meant_for_another_penalty(irl, tmp_path, words, warned):
+    line = [
+        "plan",
+        "table1-5",
+        "--rows",
+        "lunar-lander.bounce",
+        "--methods",
+        "erm,l2",
+        "--tag",
+        "x",
+    ]
+    done = irl(*line, *words, *SMOKE, "--store", tmp_path / "runs")
+    assert done.code == 0 and ("outside the range of l2" in done.err) == warned
