@@ -557,7 +557,7 @@ def test_a_lambda_meant_for_another_penalty_is_named(irl, smoke_store, words, wa
 def test_a_table_names_a_lambda_meant_for_another_penalty(irl, tmp_path, words, warned):
     line = [
         "plan",
-        "table1-5",
+        "table1",
         "--rows",
         "lunar-lander.bounce",
         "--methods",
