@@ -6,8 +6,8 @@ settings, and the mean over all methods, seed by seed, of what retraining earns 
 (t-test). In the rows of the paper's Table 1, the paper's difference beside ours. Run with
 ``python -m benchmarks.intervals docs/results/table1-bounce docs/results/table1-engine-power``.
 With ``--pool`` the reports are one: each has other seeds of the same rows, measured with the same
-experts, and learned from the same demonstrations. Reports before stage 42 do not hold the latter, so
-it is checked only among the others.
+experts, and learned from the same demonstrations. Older reports do not hold the latter, so it is
+checked only among the others.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ def _kept_rounds(airl: AIRLConfig) -> AIRLConfig:
         raise UsageError(
             f"airl.averaged_rounds = {airl.averaged_rounds} cannot be combined with airl.select = "
             f"{airl.select}: a mean of rounds has no best round",
-            "--set airl.select=last, or omit airl.averaged_rounds",
+            "--set airl.select=last, or --set airl.averaged_rounds=1",
         )
     if airl.plateau_rounds is not UNSET:
         for name, value, other in (
