@@ -266,17 +266,12 @@ def ended_submissions(session: Session, grace_seconds: float) -> list[Path]:
 
 def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -> None:
     """A line for each step that does not exist: its job, or why there is none."""
-    from irlcli.experiments.cluster.queue import queued
+    from irlcli.experiments.cluster.queue import last_jobs, queued
     from irlcli.experiments.cluster.records import records
 
     queue = _queue_of(session, plan, options)
     there = queued(plan, queue, session.store)
-    # Of the last job of each request.
-    last = {
-        submitted.identity: (record, submitted.job)
-        for record in records(session.store, queue.place)
-        for submitted in record.jobs
-    }
+    last = last_jobs(plan, records(session.store, queue.place))
     lines: list[dict[str, str | None]] = []
     exist = 0
     for name in plan.tasks:
@@ -289,8 +284,10 @@ def print_status(session: StageSession, plan: "Plan", options: ClusterOptions) -
             why = f"job {there[name].job} {place}"
             lines.append({"name": name, "state": state, "job": there[name].job, "why": why})
             continue
-        of = last.get(plan.identities[name]) if step.status in ("RUN", "RESUME") else None
-        failure = None if of is None else of[0].failure(of[1])
+        failure = None
+        if name in last and step.status in ("RUN", "RESUME"):
+            record, job = last[name]
+            failure = record.failure(job)
         if failure is not None:
             lines.append({"name": name, "state": "FAILED", "job": None, "why": failure.message})
         else:

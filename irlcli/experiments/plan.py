@@ -101,8 +101,9 @@ class Plan:
         elif self.table.kind == "control":
             tasks, self.figure = figures.controls(self._config_of)
             yield from tasks
+        only = self.selection.only
         for row in self.table.rows:
-            if not self._may_hold(f"{row}."):
+            if only is not None and not only.startswith(f"{self.selection.tag}.{row}."):
                 continue
             if self.table.kind == "experts":
                 yield from rows.experts(row, self._config_of)
@@ -117,26 +118,22 @@ class Plan:
             )
 
     def _runs(self, row: Row) -> list[RewardRun]:
-        """The row's rewards; that alone which the selected step is about, if it is about one."""
+        """The row's rewards: all of them, because a step that several share has the first one's name."""
         methods, seeds = self.table.methods, self.table.seeds
-        runs = [
-            RewardRun(
-                variant.name, method, seed, f"{row}.{step_name(variant)}", self._under[variant]
-            )
-            for variant in self.table.variants
-            for method in methods
-            for seed in seeds
-        ] or [
+        if self.table.variants:
+            return [
+                RewardRun(
+                    variant.name, method, seed, f"{row}.{step_name(variant)}", self._under[variant]
+                )
+                for variant in self.table.variants
+                for method in methods
+                for seed in seeds
+            ]
+        return [
             RewardRun(method, method, seed, str(row), self._weighted.get(method, self._config_of))
             for method in methods
             for seed in seeds
         ]
-        return [run for run in runs if self._may_hold(f"{run.name}.")] or runs
-
-    def _may_hold(self, prefix: str) -> bool:
-        """Whether the selected steps may be among those whose names begin with ``prefix``."""
-        only = self.selection.only
-        return only is None or f"{only}.".startswith(f"{self.selection.tag}.{prefix}")
 
     def _keep_only(self, only: str) -> None:
         if only not in self.tasks:
@@ -155,6 +152,8 @@ class Plan:
             kept.add(name)
             pending += self.needs[name]
         self.tasks = {name: task for name, task in self.tasks.items() if name in kept}
+        self.identities = {name: self.identities[name] for name in self.tasks}
+        self.needs = {name: self.needs[name] for name in self.tasks}
 
     def config(self, env: str) -> Config:
         """The config of ``env``, without any method's flags: the base's, if there are variants."""

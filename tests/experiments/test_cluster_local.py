@@ -11,10 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
-from test_run import REWARDS, ROW, Runs, alive
+from test_run import CHOSEN_REWARD, REWARDS, ROW, Runs, alive, choosing, publish_step
 
 from irlcli.experiments.cluster.local import Local
 from irlcli.experiments.cluster.records import LOCK, Submitted, ended, new_record
+from irlcli.requests.tables import open_plan
 from irlcli.store import Store
 
 pytest.importorskip("submitit")
@@ -275,6 +276,24 @@ def test_a_failure_is_shown_for_its_own_request_only(runs, smoke_store, tmp_path
     assert process.communicate(timeout=200) and process.returncode == 130
     assert "FAILED" in states("--tag", "late", "--set", "expert.total_steps=999")
     assert "FAILED" not in states("--tag", "smoke", "--set", "airl.gradient_penalty=0.3")
+
+
+def test_a_failure_is_found_after_its_lambda_was_chosen(irl, tmp_path):
+    """The job was submitted before the choice, when the reward was another request."""
+    session, choice = choosing(tmp_path)
+    plan = open_plan(session, choice)
+    record = new_record(session.store, Local(session.store, None).place)
+    record.add([Submitted(CHOSEN_REWARD, plan.identities[CHOSEN_REWARD], "1")])
+    failure = {"code": 1, "message": "it was asked to fail", "hint": ""}
+    (record.notes / f"{CHOSEN_REWARD}.failed").write_text(json.dumps(failure))
+    for name in [name for name in plan.tasks if name != CHOSEN_REWARD]:
+        publish_step(plan, session.store, name)
+    line = ["run", "tiny", "--experiments", choice.file, "--profile", "smoke", "--tag", "x"]
+    line += ["--choose-penalty", "1,10", "--until", "rewards", "--cluster", "local"]
+    done = irl(*line, "--status", "--json", "--store", session.store.root)
+    assert done.code == 0, done.err
+    (missing,) = json.loads(done.out)["missing"]
+    assert (missing["name"], missing["state"]) == (CHOSEN_REWARD, "FAILED")
 
 
 def test_the_status_of_jobs_of_another_machine_names_it(irl, runs, tmp_path):

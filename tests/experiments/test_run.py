@@ -406,34 +406,46 @@ def test_lambda_is_chosen_before_the_reward_is_learned(irl, tmp_path, smoke_stor
     assert told.code == 0 and f"{name}.choice: lambda {weight:g} " in told.err
 
 
-def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):
-    """Another run chooses lambda 10 while this one trains an expert; the table's own lambda is 1."""
-    tables = tmp_path / "tables.toml"
+CHOSEN_REWARD = "x.lunar-lander.engine-power.irm.0"
+
+
+def choosing(directory):
+    """A session in a new store, and the options of a table that chooses lambda."""
+    tables = directory / "tables.toml"
     tables.write_text(TABLES.replace('["erm", "irm"]', '["irm"]'))
-    store = Store(tmp_path / "runs")
+    store = Store(directory / "runs")
     store.create()
     line = {"profile": "smoke", "file": None, "overrides": [], "sources": [], "command": ["irl"]}
     session = StageSession(store.root, Silent(), **line)
-    choice = TableChoice("tiny", choose_penalty="1,10", until="rewards", tag="x", file=tables)
-    plan, others = (open_plan(session, choice) for _ in range(2))
-    reward = "x.lunar-lander.engine-power.irm.0"
+    return session, TableChoice(
+        "tiny", choose_penalty="1,10", until="rewards", tag="x", file=tables
+    )
 
-    def published(name):
-        record = others.lookup.record(others.tasks[name].request)
-        with store.working_on(record.key, True) as scratch:
-            output = scratch.new_output()
-            for file in ("policy.pt", "reward.pt", "summary.json", "metrics.parquet"):
-                (output / file).write_text(f"{file} of {name}")
-            if others.chooses(name):
-                found = {"env": "lunar-lander", "weights": [1.0, 10.0], "scores": [{}, {}]}
-                (output / "choice.json").write_text(json.dumps(found | {"chosen": 10.0, "ties": 1}))
-            store.publish(record, output, {})
-        others.refresh()
+
+def publish_step(plan, store, name):
+    """Make a step of a table that chooses lambda, without any training. It chooses 10."""
+    record = plan.lookup.record(plan.tasks[name].request)
+    with store.working_on(record.key, True) as scratch:
+        output = scratch.new_output()
+        for file in ("policy.pt", "reward.pt", "summary.json", "metrics.parquet"):
+            (output / file).write_text(f"{file} of {name}")
+        if plan.chooses(name):
+            found = {"env": "lunar-lander", "weights": [1.0, 10.0], "scores": [{}, {}]}
+            (output / "choice.json").write_text(json.dumps(found | {"chosen": 10.0, "ties": 1}))
+        store.publish(record, output, {})
+    plan.refresh()
+
+
+def test_a_choice_that_another_run_makes_meanwhile_is_used(tmp_path):
+    """Another run chooses lambda 10 while this one trains an expert; the table's own lambda is 1."""
+    session, choice = choosing(tmp_path)
+    plan, others = (open_plan(session, choice) for _ in range(2))
+    reward = CHOSEN_REWARD
 
     def command(name):
         for missing in others.tasks if name != reward else [reward]:
             if others.step(missing).status != "HIT" and (name == reward or missing != reward):
-                published(missing)
+                publish_step(others, session.store, missing)
         return [sys.executable, "-c", ""]
 
     outcome = Execution(plan, session.runner(), command, 1, Unseen()).run()

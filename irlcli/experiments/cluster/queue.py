@@ -1,6 +1,6 @@
 """A place that runs jobs, and which steps of a plan are in it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -48,22 +48,30 @@ class Queued(NamedTuple):
 def queued(plan: Plan, queue: Queue, store: Store) -> dict[str, Queued]:
     """The plan's steps that are in the queue, whoever submitted them, by name."""
     states = queue.states()
-    by_identity: dict[str, Queued] = {}
-    by_name: dict[str, Queued] = {}
-    for record in records(store, queue.place):
+    jobs = last_jobs(plan, records(store, queue.place), states)
+    return {name: Queued(job, states[job], record) for name, (record, job) in jobs.items()}
+
+
+def last_jobs(
+    plan: Plan, submissions: Iterable[Record], among: Container[str] | None = None
+) -> dict[str, tuple[Record, str]]:
+    """The last job of each of the plan's steps, by name; only jobs of ``among``, if that is given."""
+    by_identity: dict[str, tuple[Record, str]] = {}
+    by_name: dict[str, tuple[Record, str]] = {}
+    for record in submissions:
         for name, identity, job in record.jobs:
-            if job in states:
-                by_identity[identity] = by_name[name] = Queued(job, states[job], record)
+            if among is None or job in among:
+                by_identity[identity] = by_name[name] = record, job
     found = {}
     changing: set[str] = set()
     for name in plan.tasks:
-        there = by_identity.get(plan.identities[name])
+        last = by_identity.get(plan.identities[name])
         if plan.chooses(name) or not changing.isdisjoint(plan.needs[name]):
             # Once a lambda is chosen, the reward is another request under the same name.
             changing.add(name)
-            there = there or by_name.get(name)
-        if there is not None:
-            found[name] = there
+            last = last or by_name.get(name)
+        if last is not None:
+            found[name] = last
     return found
 
 
