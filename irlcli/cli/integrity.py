@@ -9,7 +9,7 @@ import typer
 from irlcli import labels
 from irlcli.cli import console as out
 from irlcli.cli.cluster import ended_submissions
-from irlcli.cli.options import collecting_command, store_command
+from irlcli.cli.options import gc_command, store_command
 from irlcli.cli.session import Session
 from irlcli.errors import IntegrityError, UsageError
 from irlcli.store import Artefact, Index
@@ -124,7 +124,7 @@ def _print_command(id16: str, command: str) -> None:
         out.print_note(f"{id16}: made by: {command}")
 
 
-@collecting_command
+@gc_command
 def gc(
     session: Session,
     delete: Annotated[

@@ -157,7 +157,7 @@ def store_command(function: Callable[..., None]) -> Callable[..., None]:
     return _with_options(function, _store_session)
 
 
-def collecting_command(function: Callable[..., None]) -> Callable[..., None]:
+def gc_command(function: Callable[..., None]) -> Callable[..., None]:
     """As :func:`store_command`, for a command that deletes, and so must not block ``gc``."""
     return _with_options(function, _store_session, reads=False)
 

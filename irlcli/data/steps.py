@@ -208,7 +208,7 @@ class Check:
         for part, following in pairwise(closed):
             assert part is not None
             checked = self._checked(part, following is None or bool(following.first[0]))
-            # Of a part beyond the time limit nothing is left.
+            # A part beyond the time limit is empty now.
             if len(checked):
                 yield checked
 

@@ -1,4 +1,4 @@
-"""What stands behind an evaluation, so that only comparable ones share a line of a table."""
+"""The parameters behind an evaluation. Only evaluations with equal ones share a line of a table."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def left_out(
     They are grouped by how they differ from the most similar wanted one.
     ``used`` are the ids of those that the report does use.
     """
-    # By digest: an artefact of somebody else's may hold lists and tables where ours hold text.
+    # Digests, because the values in a foreign artefact may not be hashable.
     expected: dict[str, list[KeyRecord]] = {}
     for record in wanted:
         expected.setdefault(digest(_subject(record)), []).append(record)

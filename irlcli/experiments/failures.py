@@ -1,9 +1,10 @@
 """Why a step failed, read from what its process left."""
 
+import signal
 from collections.abc import Sequence
 from typing import NamedTuple
 
-# Of the lines of a process, those that can hold its error and its hint.
+# A process's error and hint are among its last lines.
 LAST_LINES = 20
 
 
@@ -24,6 +25,9 @@ def failure(code: int, lines: Sequence[str]) -> Failure:
 
     if code < 0:
         reason = f"its process was killed by signal {-code}"
-        return Failure(1, reason, "run the same command again: it resumes")
+        hint = "run the same command again: it resumes"
+        if code == -signal.SIGKILL:
+            hint += ". If memory ran out, use fewer --jobs or --workers"
+        return Failure(1, reason, hint)
     message = after("error: ") or (lines[-1] if lines else f"exit code {code}")
     return Failure(code, message, after("hint: "))

@@ -240,7 +240,7 @@ def comparison(
             yield from _run(under[run.config_of], demos, run, measures, retrainings, chosen)
         except UsageError as error:
             hint = error.hint
-            if run.config_of is not config_of:
+            if run.agent != run.method:
                 hint += "; a variant's own values win over --set"
             raise UsageError(f"{row}, {run.agent}: {error.message}", hint) from None
 
@@ -433,7 +433,7 @@ def _retrained(
         [setting],
         moved,
         reward=reward.learned,
-        policy_label=f"transfer {cell.agent} {how}".strip() + f" of seed {cell.seed}",
+        policy_label=f"transfer {cell.agent} {how}".strip() + f" of seed {moved.parameters.seed}",
         reward_label=reward.label,
         # Learned returns are compared for this measure only.
         ceiling=config.ceiling if measure == "transfer" else None,

@@ -49,7 +49,7 @@ class Row(msgspec.Struct, frozen=True):
 
 
 class _Listed(msgspec.Struct, frozen=True, kw_only=True):
-    """A table as a file lists it, see :class:`Table`. Lists of a comparison are checked by name."""
+    """A table as a file lists it, see :class:`Table`. :func:`_comparison` checks its lists."""
 
     title: str | UnsetType = UNSET
     kind: str = "comparison"

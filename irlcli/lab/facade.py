@@ -372,6 +372,8 @@ class Lab:
         with self._at_work(configs, [], read_only=True) as session:
             plan = planning.open_plan(session, chosen)
             planning.check_tag(session, chosen, plan.table)
+            if only is None:
+                planning.check_worlds(plan)
             return PlannedTable(table, planning.steps_of(plan, session.console.warn))
 
     def _session(

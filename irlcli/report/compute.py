@@ -277,9 +277,9 @@ def compare_methods(p: Parameters, points: pd.DataFrame, cells: pd.DataFrame) ->
 
 
 def _same_runs(p: Parameters, row: str, x: str, y: str, measure: str) -> bool:
-    """Whether ``x`` and ``y`` have the same evaluations, so that there is nothing to compare."""
+    """Whether ``x`` and ``y`` have the same evaluations, or none, so that there is nothing to compare."""
     of_x, of_y = ({cell.run for cell in p.cells_of(row, agent, measure)} for agent in (x, y))
-    return bool(of_x) and of_x == of_y != {None}
+    return bool(of_x) and of_x == of_y
 
 
 def learned_returns(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:

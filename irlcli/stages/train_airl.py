@@ -225,7 +225,6 @@ def run(job: Job) -> None:
                 share = airl.ppo.n_envs // len(parsed)
                 theirs = [worlds_of([setting], share) for setting in parsed]
             challengers = Challengers(theirs, airl.challenger, learner, p.seed, STAGE.name)
-        stop = _at_a_plateau(airl, len(settings))
         training = Training(
             trainer,
             source=learner,
@@ -233,7 +232,7 @@ def run(job: Job) -> None:
             learner=learner,
             selector=selector,
             challengers=challengers,
-            ends=stop,
+            ends=_at_a_plateau(airl, len(settings)),
         )
         rows = run_training(job, training)
     if learner.scale <= SMALLEST_SCALE:
@@ -396,14 +395,15 @@ def _at_a_plateau(airl: AIRLConfig, settings: int) -> Callable[[Sequence[Mapping
     """The rule that stops before the last round, as a function of the rows so far."""
     from irlcli.learners.stopping import cross_entropies, plateaued
 
+    rounds = airl.plateau_rounds
+    if isinstance(rounds, UnsetType):
+        return lambda _: False
+    # The loss changes until lambda has its full value. With a penalty this is one round later than
+    # full_weight_from().
+    first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
+
     def stop(rows: Sequence[Mapping[str, Any]]) -> bool:
-        if isinstance(airl.plateau_rounds, UnsetType):
-            return False
-        # The loss changes until lambda has its full value. With a penalty this is one round later
-        # than full_weight_from().
-        first = airl.penalty_warmup_rounds + airl.penalty_ramp_rounds
-        newest = rows[-2 * airl.plateau_rounds * settings :]
-        return plateaued(cross_entropies(newest, first), airl.plateau_rounds)
+        return plateaued(cross_entropies(rows[-2 * rounds * settings :], first), rounds)
 
     return stop
 

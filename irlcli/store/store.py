@@ -29,7 +29,7 @@ from irlcli.store.scratch import CHECKPOINT, Scratch
 # publish, integrity, collect and substitute are imported by the methods that need them: a hit,
 # which most commands are, loads none of them.
 if TYPE_CHECKING:
-    from irlcli.store.collect import Missing
+    from irlcli.store.garbage import Missing
     from irlcli.store.integrity import Verified
     from irlcli.store.manifest import Manifest, Output
     from irlcli.store.sources import Place
@@ -308,7 +308,7 @@ class Store:
         from irlcli.store.substitute import receive
 
         layouts.make_directories(self._writable)
-        # Of killed copies: they may be large.
+        # Killed copies leave large files.
         remove_leftovers(self._layout.work)
         receive(self._writable, source, artefact.id, advance)
 
@@ -341,25 +341,25 @@ class Store:
     # Collection
 
     def garbage(self, grace_seconds: float, index: Index | None = None) -> list[Artefact]:
-        """Artefacts that gc would remove: see :func:`irlcli.store.collect.garbage`."""
-        from irlcli.store.collect import garbage
+        """Artefacts that gc would remove: see :func:`irlcli.store.garbage.garbage`."""
+        from irlcli.store.garbage import garbage
 
         return garbage(self._layout, index or self.index(), grace_seconds, self.warn)
 
     def missing(self, index: Index) -> dict[str, Missing]:
-        """Missing artefacts: see :func:`irlcli.store.collect.missing`."""
-        from irlcli.store.collect import missing
+        """Missing artefacts: see :func:`irlcli.store.garbage.missing`."""
+        from irlcli.store.garbage import missing
 
         return missing(self._layout, index)
 
     def stale_work(self, grace_seconds: float) -> list[Path]:
-        """Working directories that gc would remove: see :func:`irlcli.store.collect.stale_work`."""
-        from irlcli.store.collect import stale_work
+        """Working directories that gc would remove: see :func:`irlcli.store.garbage.stale_work`."""
+        from irlcli.store.garbage import stale_work
 
         return stale_work(self._layout, grace_seconds)
 
     def collect(self, grace_seconds: float) -> tuple[list[Artefact], list[Path]]:
-        """Remove garbage: see :func:`irlcli.store.collect.collect`."""
-        from irlcli.store.collect import collect
+        """Remove garbage: see :func:`irlcli.store.garbage.collect`."""
+        from irlcli.store.garbage import collect
 
         return collect(self._writable, grace_seconds, self.warn)

@@ -525,6 +525,8 @@ def test_settings_with_other_spaces_are_not_used_together(bench, spaces, observe
         line = [*command, "cart", "--experiments", "tables.toml", "--profile", "smoke"]
         table = bench.irl(*line)
         assert table.code == 2 and kind in table.err and "with mass=1x" in table.err, table.err
+    with pytest.raises(UsageError, match=kind):
+        irlcli.Lab("runs", profile="smoke").plan("cart", experiments="tables.toml")
     assert "1x" not in bench.irl("ls", "--stage", "train-expert").out
     checked = bench.irl("envs", "check", "cart.toml")
     assert (

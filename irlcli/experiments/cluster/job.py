@@ -1,6 +1,6 @@
 """What a job of a cluster does: run the command that makes one step, and ask to be requeued if stopped.
 
-This module is loaded on the nodes. It writes what became of the step beside the job's logs, because
+This module is loaded on the nodes. It writes the outcome of the step beside the job's logs, because
 Slurm forgets a job within minutes where it has no database.
 """
 
@@ -32,7 +32,7 @@ class StepJob(NamedTuple):
         name: of the step.
         command: its command line.
         directory: working directory of the command.
-        notes: directory for what became of the step.
+        notes: directory for the outcome of the step.
         requeues: how often the job may be requeued.
     """
 

@@ -38,7 +38,7 @@ class Record:
     """One submission.
 
     Attributes:
-        directory: with the logs and what became of the steps.
+        directory: with the logs and the outcome of each step.
         place: of the queue that runs the jobs.
         jobs: in the order of their submission.
     """
@@ -54,7 +54,7 @@ class Record:
 
     @property
     def notes(self) -> Path:
-        """Directory for what became of the steps."""
+        """Directory for the outcome of each step."""
         return self.directory / "steps"
 
     def add(self, jobs: list[Submitted]) -> None:

@@ -285,7 +285,7 @@ class Submission:
         return started
 
     def _ended(self, name: str, last: bool) -> bool:
-        """Whether it is clear what became of a step whose job has left the queue.
+        """Whether the outcome of a step is known whose job has left the queue.
 
         ``last``: its files have had the time to become visible.
         """
@@ -320,7 +320,7 @@ class Submission:
 
     def _show_progress(self, name: str) -> None:
         line = self._records[name].last_line(self._ids[name])
-        # Of a stage's lines, those that say how far it is are indented.
+        # Stages indent their progress lines.
         if line.startswith("  "):
             self._display.line(name, line)
 
