@@ -16,7 +16,7 @@ from irlcli.experiments.inputs import source_in
 from irlcli.experiments.plan import Plan
 from irlcli.experiments.rows import made_by
 from irlcli.interventions import listed_settings, without_cue
-from irlcli.report.parameters import ASSESS, CUE, Cell, Row, Run
+from irlcli.report.parameters import ASSESS, CUE, REWARD_LEARNING, Cell, Row, Run
 from irlcli.stages import report, report_experts
 from irlcli.stages.base import Request, Source
 from irlcli.store import Artefact
@@ -86,7 +86,7 @@ def _experts(
     for row in plan.table.rows:
         config = plan.config(row.env)
         own = config.interventions[row.knob].expert
-        experts[f"{row.env} {row.knob}"] = config.expert if own is None else own
+        experts[row.name] = config.expert if own is None else own
     parameters = report_experts.Parameters(
         command=command,
         steps={
@@ -116,7 +116,7 @@ def _cells(plan: Plan) -> tuple[list[Cell], dict[str, Source]]:
         for part, learned in task.curves.items():
             made = _held(plan, learned)
             if made is not None:
-                sources[_curve_role(cell, part)] = source_in(made, "metrics.parquet")
+                sources[cell.curve_role(part)] = source_in(made, "metrics.parquet")
     return cells, sources
 
 
@@ -135,12 +135,6 @@ def _reason(plan: Plan, request: Request) -> str:
     if first.status == "FOUND":
         return f"{stage} is {first.why}, and `irl run` copies it"
     return f"no result of {stage}"
-
-
-def _curve_role(cell: Cell, part: str) -> str:
-    if cell.agent == "expert":
-        return f"{cell.env} {cell.place} {part}"
-    return f"{cell.row} {cell.agent} {cell.seed} {part}"
 
 
 def _artefacts(plan: Plan) -> dict[str, Artefact]:
@@ -173,8 +167,8 @@ def _rows(plan: Plan, choices: Mapping[_Run, tuple[float, Artefact]]) -> list[Ro
                 unseen=str(unseen[0]),
                 demonstrations=demos.parameters.episodes,
                 config=msgspec.to_builtins(configs),
-                chosen=_weights(plan, f"{row.env} {row.knob}", choices),
-                student_share=_student_shares(plan, f"{row.env} {row.knob}"),
+                chosen=_weights(plan, row.name, choices),
+                student_share=_student_shares(plan, row.name),
             )
         )
     return rows
@@ -185,7 +179,7 @@ def _student_shares(plan: Plan, row: str) -> dict[str, float]:
     found = {}
     for task in plan.cells:
         assert task.cell is not None
-        learned = task.curves.get("reward-learning")
+        learned = task.curves.get(REWARD_LEARNING)
         if task.cell.row == row and learned is not None:
             challenger = learned.parameters.airl.challenger
             if challenger.life > 0:
@@ -202,7 +196,7 @@ def _choices(plan: Plan) -> dict[_Run, tuple[float, Artefact]]:
             choice = _held(plan, made_by(task.request.inputs["penalty choice"]))
             if choice is not None:
                 weight = task.request.parameters.airl.penalty_weight
-                found[f"{row.env} {row.knob}", method, seed] = weight, choice
+                found[row.name, method, seed] = weight, choice
     return found
 
 

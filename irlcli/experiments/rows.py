@@ -34,7 +34,16 @@ from irlcli.experiments.variants import ConfigOf
 from irlcli.interventions import Setting, listed_settings
 from irlcli.methods import method
 from irlcli.report.agents import IN_DISTRIBUTION, RETRAINED
-from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, has_held_out
+from irlcli.report.parameters import (
+    ASSESS,
+    CUE,
+    EXPERT_BY_REWARD,
+    EXPERT_LEARNING,
+    REWARD_LEARNING,
+    TRANSFER_LEARNING,
+    Cell,
+    has_held_out,
+)
 from irlcli.stages import (
     assess,
     choose_penalty,
@@ -133,7 +142,7 @@ class _RowRequests:
         self._experts: dict[Setting, Request] = {}
 
     def cell(self, *args: Any, **kwargs: Any) -> Cell:
-        return Cell(f"{self.row.env} {self.row.knob}", *args, **kwargs)
+        return Cell(self.row.name, *args, **kwargs)
 
     def expert(self, setting: Setting) -> Request:
         if setting not in self._experts:
@@ -195,7 +204,7 @@ class _Reward(NamedTuple):
     @property
     def curves(self) -> dict[str, Request]:
         """What a cell shows of the reward learning; cloning has no curve."""
-        return {"reward-learning": self.learned} if self.learned.stage.name == "train-airl" else {}
+        return {REWARD_LEARNING: self.learned} if self.learned.stage.name == "train-airl" else {}
 
     @property
     def label(self) -> str:
@@ -439,7 +448,7 @@ def _retrained(
         ceiling=config.ceiling if measure == "transfer" else None,
     )
     first = measure == "transfer" and not retraining
-    own = {"transfer-learning": moved} if first else {}
+    own = {TRANSFER_LEARNING: moved} if first else {}
     yield Task(f"{name}-returns", "returns", request, cell, reward.curves | own)
 
 
@@ -469,7 +478,7 @@ def experts(row: Row, config_of: ConfigOf) -> Iterator[Task]:
         for setting in settings:
             name, request = requests.own_returns(setting)
             cell = requests.cell("expert", measure, place=str(setting))
-            yield Task(name, "returns", request, cell, {"learning": requests.expert(setting)})
+            yield Task(name, "returns", request, cell, {EXPERT_LEARNING: requests.expert(setting)})
 
 
 def made_by(source: Source | From) -> Request:

@@ -47,6 +47,11 @@ class Row(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         return f"{self.env}.{self.knob}"
 
+    @property
+    def name(self) -> str:
+        """``ENV KNOB``, as reports have it."""
+        return f"{self.env} {self.knob}"
+
 
 class _Listed(msgspec.Struct, frozen=True, kw_only=True):
     """A table as a file lists it, see :class:`Table`. :func:`_comparison` checks its lists."""

@@ -14,7 +14,7 @@ from irlcli.labels import duration
 from irlcli.report.agents import PROGRESS
 from irlcli.report.drawing import panels, save
 from irlcli.report.lineage import commits
-from irlcli.report.parameters import Cell, Run
+from irlcli.report.parameters import EXPERT_LEARNING, Cell, Run
 from irlcli.report.tables import Table, markdown_table
 
 _TITLE = "Experts: true return in their own settings"
@@ -140,8 +140,8 @@ def draw(directory: Path, cells: Sequence[Cell], learning: Mapping[str, pd.DataF
     """
     curves: dict[str, list[tuple[Cell, pd.DataFrame]]] = {}
     for cell in cells:
-        metrics = learning.get(f"{cell.env} {cell.place} learning")
-        if cell.agent == "expert" and metrics is not None:
+        if cell.agent == "expert" and cell.curve_role(EXPERT_LEARNING) in learning:
+            metrics = learning[cell.curve_role(EXPERT_LEARNING)]
             curves.setdefault(cell.row, []).append((cell, metrics))
     with matplotlib.rc_context(
         {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}

@@ -26,6 +26,17 @@ def has_held_out(measures: Sequence[str]) -> bool:
     return not set(measures) <= {*IN_DISTRIBUTION, ASSESS, CUE}
 
 
+# Parts of a run whose metrics a report draws.
+REWARD_LEARNING = "reward-learning"
+TRANSFER_LEARNING = "transfer-learning"
+EXPERT_LEARNING = "learning"
+
+
+def curve_role(row: str, method: str, seed: int, part: str) -> str:
+    """The role of the metrics of a reward's ``part``, among the inputs of a report."""
+    return f"{row} {method} {seed} {part}"
+
+
 class Cell(msgspec.Struct, frozen=True):
     """One evaluation that the report needs.
 
@@ -71,6 +82,13 @@ class Cell(msgspec.Struct, frozen=True):
         seed = "-" if self.seed is None else self.seed
         text = f"{self.row} {self.agent} {seed} {self.measure} {self.place}".strip()
         return f"{text} retraining {self.retraining}" if self.retraining else text
+
+    def curve_role(self, part: str) -> str:
+        """The role of the metrics of training behind it; an expert's have no part of a reward's run."""
+        if self.agent == "expert":
+            return f"{self.env} {self.place} {part}"
+        assert self.seed is not None
+        return curve_role(self.row, self.agent, self.seed, part)
 
 
 class Variant(msgspec.Struct, frozen=True):

@@ -19,7 +19,13 @@ from irlcli.report.agents import IN_DISTRIBUTION, beside, colours, own_measure, 
 from irlcli.report.build import Report
 from irlcli.report.compute import sample
 from irlcli.report.drawing import offsets, panels, save
-from irlcli.report.parameters import Parameters, Row
+from irlcli.report.parameters import (
+    REWARD_LEARNING,
+    TRANSFER_LEARNING,
+    Parameters,
+    Row,
+    curve_role,
+)
 from irlcli.report.result_tables import paper_row
 
 _LINES = {"expert": "-", "reused": "-.", "random": "--", "idle": ":"}
@@ -149,14 +155,14 @@ def learning_curves(p: Parameters, learning: Mapping[str, pd.DataFrame]) -> dict
     with style(INK):
         for row in p.rows:
             for kind, what in (
-                ("reward-learning", "reward learning: the student, in distribution"),
-                ("transfer-learning", "transfer: retraining on the frozen reward"),
+                (REWARD_LEARNING, "reward learning: the student, in distribution"),
+                (TRANSFER_LEARNING, "transfer: retraining on the frozen reward"),
             ):
                 runs = {
                     (method, seed): learning[role]
                     for method in p.methods
                     for seed in p.seeds
-                    if (role := f"{row.name} {method} {seed} {kind}") in learning
+                    if (role := curve_role(row.name, method, seed, kind)) in learning
                 }
                 if runs:
                     found[f"{row.name}, {what}"] = as_svg(_curves(p, runs), f"curves{len(found)}")

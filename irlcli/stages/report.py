@@ -10,7 +10,16 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from irlcli.report.lineage import demonstrations
-from irlcli.report.parameters import ASSESS, CUE, EXPERT_BY_REWARD, Cell, Parameters
+from irlcli.report.parameters import (
+    ASSESS,
+    CUE,
+    EXPERT_BY_REWARD,
+    REWARD_LEARNING,
+    TRANSFER_LEARNING,
+    Cell,
+    Parameters,
+    curve_role,
+)
 from irlcli.stages.base import Job, Request, Source, Stage
 from irlcli.store import read_json
 
@@ -50,14 +59,14 @@ def run(job: Job) -> None:
     learning = {
         role: _of_the_kept(pd.read_parquet(path))
         for role, path in job.inputs.items()
-        if role.endswith("-learning")
+        if role.endswith((REWARD_LEARNING, TRANSFER_LEARNING))
     }
     rewards = {
         (row.name, method, seed): learning[role]
         for row in p.rows
         for method in p.methods
         for seed in p.seeds
-        if (role := f"{row.name} {method} {seed} reward-learning") in learning
+        if (role := curve_role(row.name, method, seed, REWARD_LEARNING)) in learning
     }
     assessments = _of_rewards(job, ASSESS, "assessment.json", descriptions.Assessment)
     contrasts = _of_rewards(job, CUE, "cue.json", descriptions.CueContrast)

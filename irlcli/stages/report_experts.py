@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import msgspec
 
-from irlcli.report.parameters import Cell, Run
+from irlcli.report.parameters import EXPERT_LEARNING, Cell, Run
 from irlcli.stages.base import Job, Request, Source, Stage
 
 
@@ -61,7 +61,7 @@ def run(job: Job) -> None:
     learning = {
         role: pd.read_parquet(path)
         for role, path in job.inputs.items()
-        if role.endswith(" learning")
+        if role.endswith(f" {EXPERT_LEARNING}")
     }
     numbers = experts.summarise(p.cells, p.runs, p.steps, summaries)
     table = experts.text_table(numbers)
