@@ -184,10 +184,10 @@ class _RowRequests:
         return f"{self.row}.{name}", request
 
 
-class _Reward(NamedTuple):
-    """A reward of a row, or the clone of a method without one, with what its tasks depend on.
+class _Learned(NamedTuple):
+    """What a method learned, a reward or only a clone, with what its tasks depend on.
 
-    Only a reward has a ``label``.
+    A clone has no ``label``: its policy is measured by the true reward only.
 
     Attributes:
         requests: of its row, under its own configs.
@@ -299,7 +299,7 @@ def _run(
     if not method(run.method).learns_reward:
         cloned = clone.request(From(demos), env, trained, requests.config, run.seed)
         yield Task(run.name, "rewards", cloned)
-        yield from _imitation(_Reward(requests, demos, cloned, run, measures))
+        yield from _imitation(_Learned(requests, demos, cloned, run, measures))
         return
     airl = run.config_of(env, run.method).airl_of(trained)
     basis = {}
@@ -320,7 +320,7 @@ def _run(
         basis = {"penalty choice": From(choice, "choice.json")}
     learned = train_airl.request(From(demos), env, trained, airl, run.seed, basis)
     yield Task(run.name, "rewards", learned)
-    reward = _Reward(requests, demos, learned, run, measures)
+    reward = _Learned(requests, demos, learned, run, measures)
     yield from _imitation(reward)
     retrained: dict[assess.Entry, From] = {}
     for measure in (measure for measure in RETRAINED if measure in measures):
@@ -347,7 +347,7 @@ def _run(
         yield from _assessment(reward, retrained)
 
 
-def _imitation(reward: _Reward) -> Iterator[Task]:
+def _imitation(reward: _Learned) -> Iterator[Task]:
     """What the policy earns that was trained on the demonstrations: a student, or a clone."""
     requests, run = reward.requests, reward.run
     label = f"{reward.learned.stage.name} {run.agent} of seed {run.seed}"
@@ -358,7 +358,7 @@ def _imitation(reward: _Reward) -> Iterator[Task]:
             yield Task(name, "returns", request, reward.cell(measure), reward.curves)
 
 
-def _expert_by_reward(reward: _Reward) -> Task:
+def _expert_by_reward(reward: _Learned) -> Task:
     """The learned return of the unseen setting's expert."""
     requests = reward.requests
     (setting,) = requests.unseen
@@ -374,7 +374,7 @@ def _expert_by_reward(reward: _Reward) -> Task:
     return Task(f"{reward.run.name}.expert-by-reward", "returns", request, cell)
 
 
-def _assessment(reward: _Reward, retrained: Mapping[assess.Entry, From]) -> Iterator[Task]:
+def _assessment(reward: _Learned, retrained: Mapping[assess.Entry, From]) -> Iterator[Task]:
     """The bank of a row's policies, and how well the reward ranks them.
 
     It has the unseen setting only where another measure does.
@@ -410,7 +410,7 @@ def _known_as(measure: str, retraining: int) -> str:
     return f"{name} {retraining + 1}" if retraining else name
 
 
-def _retraining(reward: _Reward, measure: str, setting: Setting, retraining: int) -> Request:
+def _retraining(reward: _Learned, measure: str, setting: Setting, retraining: int) -> Request:
     """A policy trained on the reward in ``setting``."""
     return transfer.request(
         From(reward.learned, "reward.pt"),
@@ -424,7 +424,7 @@ def _retraining(reward: _Reward, measure: str, setting: Setting, retraining: int
 
 
 def _retrained(
-    reward: _Reward, moved: Request, measure: str, setting: Setting, retraining: int
+    reward: _Learned, moved: Request, measure: str, setting: Setting, retraining: int
 ) -> Iterator[Task]:
     """The policy of ``moved``, and what it earns in ``setting``, by the reward too."""
     in_distribution = measure == "transfer-id"

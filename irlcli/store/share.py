@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from irlcli.errors import IntegrityError, NewerFormat
 from irlcli.store.artefact import Artefact, stored_inputs
-from irlcli.store.substitute import Advance, ancestors
+from irlcli.store.substitute import Advance, ancestors, check
 
 if TYPE_CHECKING:
     from irlcli.store.sources import Place
@@ -79,13 +79,16 @@ def share(
         damaged: set[str] = set()
         for artefact in wanted:
             if artefact.id not in held:
-                try:
-                    _require(artefact, source, damaged)
-                    target.receive(source, artefact, advance)
-                except IntegrityError as error:
-                    if not partial or not error.message.startswith(f"{source.root}/"):
-                        raise
-                    warn(f"skipping artefact {artefact.id}: {error.message}")
+                why = _lost(artefact, source, damaged)
+                if not why:
+                    try:
+                        target.receive(source, artefact, advance)
+                    except IntegrityError as error:
+                        if not (partial and _is_damaged(source, artefact.id)):
+                            raise
+                        why = error.message
+                if why:
+                    warn(f"skipping artefact {artefact.id}: {why}")
                     damaged.add(artefact.id)
                     continue
             # Also of what was there: a copy may have been killed before this.
@@ -101,12 +104,21 @@ def share(
     return Shared(copied, present, given, taken, diverged)
 
 
-def _require(artefact: Artefact, source: Place, damaged: Collection[str]) -> None:
-    """Refuse what was made from one of the artefacts that are ``damaged``, if there are any."""
-    if damaged:
-        lost = [a.id for a in ancestors(artefact, source.manifests(artefact.id)) if a.id in damaged]
-        if lost:
-            raise IntegrityError(f"{source.root}/{lost[0]}, from which it was made, is damaged")
+def _lost(artefact: Artefact, source: Place, damaged: Collection[str]) -> str:
+    """Which artefact of ``damaged`` this one was made from, as a sentence; empty if none."""
+    made_from = ancestors(artefact, source.manifests(artefact.id)) if damaged else ()
+    lost = [a.id for a in made_from if a.id in damaged]
+    return f"{source.root}/{lost[0]}, from which it was made, is damaged" if lost else ""
+
+
+def _is_damaged(source: Place, id16: str) -> bool:
+    """Whether ``source`` itself, not the way to the target, changed an artefact's bytes."""
+    try:
+        manifest, _ = source.contents(id16)
+        check(source, id16, manifest)
+    except IntegrityError:
+        return True
+    return False
 
 
 def _with_ancestors(

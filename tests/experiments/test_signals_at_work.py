@@ -27,6 +27,14 @@ def one_line(job):
     (job.output / "text").write_text("done\n")
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """nohup makes the tests, and their children, deaf to SIGHUP."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("number", STOPPING)
 def test_a_signal_while_an_artefact_is_published_loses_no_work(tmp_path, monkeypatch, number):
     publish = Store.publish
@@ -112,5 +120,8 @@ def test_work_ends_in_order_after_its_terminal_has_closed(tmp_path):
     assert b"at work" in os.read(terminal, 100)
     os.close(terminal)
     process.send_signal(signal.SIGHUP)
-    assert process.wait(timeout=60) == 0
+    try:
+        assert process.wait(timeout=60) == 0
+    finally:
+        process.kill()
     assert (tmp_path / "checkpoint").read_text() == "whole"
