@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from irlcli.errors import Busy, IntegrityError, NotFound
-from irlcli.store import Index, KeyRecord, Store, collect, integrity, read
+from irlcli.store import Index, KeyRecord, Store, garbage, integrity, read
 from irlcli.store import artefact as artefact_module
 from irlcli.store import publish as publishing
 from irlcli.store.layout import Layout
@@ -320,7 +320,7 @@ def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monk
     artefact = publish(empty_store).artefact
     with empty_store.working_on("0" * 64, wait=False) as scratch:
         scratch.save(b"state")
-    original = collect._older
+    original = garbage._older
 
     def vanishing(path, limit):
         if path.name == artefact.id:
@@ -330,7 +330,7 @@ def test_a_dry_run_survives_what_disappears_meanwhile(empty_store, publish, monk
             scratch.clear()
         return original(path, limit)
 
-    monkeypatch.setattr(collect, "_older", vanishing)
+    monkeypatch.setattr(garbage, "_older", vanishing)
     assert empty_store.garbage(-1.0) == []
     assert empty_store.stale_work(-1.0) == []
 
