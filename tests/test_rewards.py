@@ -412,6 +412,10 @@ def test_an_exported_reward_runs_without_the_package(irl, tmp_path, env):
     about = {"irlcli.json": ""}
     torch.export.load(out, extra_files=about)
     assert json.loads(about["irlcli.json"])["env"] == env
+    line = ["transfer", "--reward", out, "--ood", "engine-power=2x", "--store", tmp_path / "s"]
+    refused = irl(*line)
+    reason = refused.err.partition("(")[2].partition(")\n")[0]
+    assert refused.code == 4 and 0 < len(reason) < 100, refused.err
 
 
 def test_a_reward_is_exported_once_and_only_a_reward(irl, smoke_store, tmp_path):

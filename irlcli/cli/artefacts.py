@@ -9,7 +9,7 @@ from irlcli import labels
 from irlcli.cli import console as out
 from irlcli.cli.options import Ref, store_command
 from irlcli.cli.session import Session
-from irlcli.errors import suggest
+from irlcli.errors import IntegrityError, suggest
 from irlcli.store import Artefact, Index, Store
 from irlcli.store.artefact import stored_inputs
 
@@ -37,7 +37,9 @@ def ls(
     names: dict[str, list[str]] = {}
     for name, id16 in store.names().items():
         names.setdefault(id16, []).append(name)
-    index = store.index()
+    index, damage = _index_of(session, store)
+    if damage and session.as_json:
+        raise damage
     stored = list(index.artefacts.values())
     makers = labels.makers(artefact.manifest for artefact in stored)
     found: list[dict[str, Any]] = [
@@ -63,6 +65,32 @@ def ls(
     rows = [[f["id"], f["stage"], f["about"], f["budget"], ", ".join(f["names"])] for f in found]
     if rows:
         out.print_table(["id", "stage", "about", "budget", "names"], rows)
+    if damage:
+        raise damage
+
+
+def _index_of(session: Session, store: "Store | Remote") -> tuple[Index, IntegrityError | None]:
+    """The sound artefacts, and the error of a damaged one; all of these are in quarantine then.
+
+    Warns of damaged names, and of every damaged artefact but the last.
+
+    Raises:
+        IntegrityError: a damaged artefact cannot be moved to quarantine.
+    """
+    lost = store.damaged_names() if isinstance(store, Store) else ()
+    for name in lost:
+        session.console.warn(f"the name {name!r} is damaged; `irl verify` says how to mend it")
+    damage: IntegrityError | None = None
+    while True:
+        try:
+            return store.index(), damage
+        except IntegrityError as error:
+            if damage is not None:
+                # The same one again could not be moved.
+                if error.message == damage.message:
+                    raise
+                session.console.warn(f"{damage.message}; {damage.hint}")
+            damage = error
 
 
 @store_command
@@ -114,7 +142,9 @@ def _tree(index: Index, artefact: Artefact, descendants: tuple[str, ...]) -> dic
         others = [source for source in sources if source.id not in descendants]
         source = min(others, key=lambda s: s.id not in recorded, default=None)
         origin = _tree(index, source, descendants) if source is not None else None
-        inputs.append({"role": role, "sha256": record.inputs[role], "from": origin})
+        lost = next(iter(recorded), None) if origin is None else None
+        found = {"role": role, "sha256": record.inputs[role], "missing": lost, "from": origin}
+        inputs.append(found)
     return {
         "id": artefact.id,
         "stage": record.stage,
@@ -128,7 +158,9 @@ def _lines(node: dict[str, Any], indent: str) -> list[str]:
     text = "  ".join(node[field] for field in ("id", "stage", "about", "budget") if node[field])
     lines = [f"{indent}{text}"]
     for item in node["inputs"]:
-        if item["from"] is None:
+        if item["missing"] is not None:
+            lines.append(f"{indent}  {item['missing']}  not in this store; `irl verify` says more")
+        elif item["from"] is None:
             sha = item["sha256"][:16]
             lines.append(f"{indent}  a file that is not in this store, sha256 {sha}...")
         else:

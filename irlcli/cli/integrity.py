@@ -73,7 +73,8 @@ def verify(
     if session.as_json:
         out.print_json("verify", result)
     else:
-        out.print_data(f"{out.counted(checked, 'artefact')} verified")
+        done = "have the right sizes (contents were not read)" if quick else "verified"
+        out.print_data(f"{out.counted(checked, 'artefact')} {done}")
 
 
 def _warn_of_names(session: Session, index: Index) -> None:
@@ -174,6 +175,7 @@ def gc(
     verb = "removed" if delete else "would be removed (add --delete)"
     logs = f", {out.counted(len(submissions), 'submission')}" if submissions else ""
     scratch = f" and scratch of {out.counted(len(work), 'run')}" if work else ""
+    young = f"; what is younger than {grace_days:g} days is kept (--grace-days)" if grace else ""
     out.print_note(
-        f"{out.counted(len(artefacts), 'artefact')}, {size:,} bytes{logs}{scratch} {verb}"
+        f"{out.counted(len(artefacts), 'artefact')}, {size:,} bytes{logs}{scratch} {verb}{young}"
     )

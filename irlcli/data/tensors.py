@@ -103,7 +103,7 @@ def from_bytes(data: bytes) -> Any:
         if _out_of_memory(error):
             raise MemoryError(first_line(error)[:200]) from None
         # A crafted archive makes zipfile and torch raise almost anything.
-        raise ValueError(first_line(error)[:200]) from None
+        raise ValueError(first_line(error).partition(". ")[0][:200]) from None
 
 
 def restore(data: bytes | None, names: set[str], discard: Callable[[str], None]) -> Any:

@@ -400,10 +400,11 @@ def warn_of_weight(console: "RunConsole", name: str, config: "AIRLConfig | MaxEn
         console.warn(f"lambda is 0: {name} learns without its penalty, {config.penalty}")
 
 
-def warn_of_scale(console: "RunConsole", penalty: str, weight: float) -> None:
+def warn_of_scale(console: "RunConsole", penalty: str, weight: float, setter: str) -> None:
     """Warn if AIRL's lambda, meant for another penalty, does not suit ``penalty``.
 
-    Lambda means another thing in each penalty, and settings files hold one value.
+    Lambda means another thing in each penalty, and settings files hold one value. ``setter`` is what
+    sets it for this penalty alone.
     """
     from irlcli.penalties import PENALTIES
 
@@ -412,5 +413,5 @@ def warn_of_scale(console: "RunConsole", penalty: str, weight: float) -> None:
     if own and weight > 0 and not suited[0] <= weight <= suited[-1]:
         console.warn(
             f"lambda {weight:g} is outside the range of {penalty}, {suited[0]:g} to {suited[-1]:g}: "
-            "set it, or choose it with --choose-penalty own"
+            f"set it by {setter}, or choose it with --choose-penalty own"
         )

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from irlcli.envs.registry import environment
 from irlcli.errors import UsageError
 from irlcli.experiments import bank, references
+from irlcli.experiments.inputs import checked
 from irlcli.interventions import Setting, check_observed, parse_setting
 from irlcli.requests import arguments
 from irlcli.requests.session import StageSession
@@ -51,6 +52,8 @@ def assess(
     known = arguments.env_name(env)
     source, origin = references.tensor_file(session.store, reward, "reward")
     arguments.check_env(reward, origin.env, known)
+    # Before the bank acts, which takes long.
+    checked(session.store, source)
     config = session.config(origin.env, {"evaluation.episodes": episodes})
     settings = [parse_setting(origin.env, text) for text in origin.settings]
     if where.given:

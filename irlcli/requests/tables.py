@@ -151,7 +151,9 @@ def open_plan(session: StageSession, choice: TableChoice, others: Iterable[str] 
         requests = [task.request for task in plan.tasks.values()]
         learned = [r.parameters.airl for r in requests if r.stage.name == "train-airl"]
         for penalty, weight in sorted({(airl.penalty, airl.penalty_weight) for airl in learned}):
-            arguments.warn_of_scale(session.console, penalty, weight)
+            arguments.warn_of_scale(
+                session.console, penalty, weight, "penalty_weights in a table of --experiments"
+            )
     if choice.only is None and session.asked:
         # The processes that make one step each would repeat it. Later phases may read what the
         # first ones do not.

@@ -76,7 +76,9 @@ def train_airl(
     if (penalty_weight, choose_penalty) == (None, None) and not arguments.weights_set(
         session.overrides
     ):
-        arguments.warn_of_scale(session.console, airl.penalty, airl.penalty_weight)
+        arguments.warn_of_scale(
+            session.console, airl.penalty, airl.penalty_weight, "--penalty-weight"
+        )
     basis: dict[str, Source] = {}
     if choose_penalty is not None:
         # A bad option must fail before the choice of lambda, which takes long.

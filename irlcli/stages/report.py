@@ -228,4 +228,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 44, run)
+STAGE = Stage("report", 45, run)

@@ -100,6 +100,11 @@ def store_around(path: Path) -> Path | None:
     return next((root for root in around if Layout(root).marker.is_file()), None)
 
 
+def _whole(layout: Layout) -> str:
+    """How to mend the file by which a store is known."""
+    return f"""if this is a store of irlcli, write {{"format": {FORMAT}}} to {layout.marker}"""
+
+
 def check(layout: Layout) -> None:
     """Check that the root is a store of a known format, an empty directory, or absent.
 
@@ -117,12 +122,13 @@ def check(layout: Layout) -> None:
     except OSError as error:
         raise UsageError(f"{root} cannot be a store ({error.strerror})", hint) from None
     if marker.exists():
-        value = read_json(marker)
+        try:
+            value = read_json(marker)
+        except IntegrityError as error:
+            raise IntegrityError(error.message, _whole(layout)) from None
         version = value.get("format") if isinstance(value, dict) else None
         if type(version) is not int or version < 1:
-            raise IntegrityError(
-                f"{marker} does not contain a format version", "check that this is an irlcli store"
-            )
+            raise IntegrityError(f"{marker} does not contain a format version", _whole(layout))
         if version > FORMAT:
             raise IntegrityError(
                 f"{root} is a store of format {version}, newer than the supported {FORMAT}",
@@ -136,6 +142,8 @@ def check(layout: Layout) -> None:
         if marker.exists():
             # Another process created the store meanwhile.
             return check(layout)
+        if any(path.is_dir() for path in (layout.locks, layout.names)):
+            raise IntegrityError(f"the store {root} has no file STORE", _whole(layout))
         raise UsageError(
             f"{root} contains files but is not a store",
             "name a store" if layout.read_only else "name a store, or an empty or new directory",

@@ -88,6 +88,9 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     from irlcli.store.integrity import quarantined
 
     head = text.partition("/")[0]
+    if head in damaged_names(layout):
+        naming = shlex.join(["irl", "name", "REF", head, *layout.option])
+        return NotFound(f"the name {head!r} is damaged", f"name the artefact again: `{naming}`")
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
     listing = f"{layout.listing}, `{pull}` copies one from another store"

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import json
 import os
+import re
 import resource
+import shlex
 import shutil
 import subprocess
 import sys
@@ -348,6 +351,67 @@ def test_verify_names_lost_names_beside_damaged_artefacts(irl, store_copy):
     done = irl("verify", "--store", store)
     assert done.code == 4 and store_copy.transfer in done.err
     assert "these names point to nothing now: moved, score" in done.err
+
+
+def test_ls_lists_what_is_sound_beside_the_damaged(irl, store_copy):
+    store = store_copy.path
+    for id16 in (store_copy.transfer, store_copy.evaluation):
+        halve(store / id16 / "manifest.json")
+    done = irl("ls", "--store", store)
+    assert done.code == 4 and store_copy.transfer in done.err and store_copy.evaluation in done.err
+    assert sum(line.startswith("error: ") for line in done.err.splitlines()) == 1
+    assert store_copy.airl in done.out and store_copy.transfer not in done.out
+    again = irl("ls", "--store", store)
+    assert (again.code, again.out) == (0, done.out)
+
+
+def test_a_damaged_name_is_named(irl, store_copy):
+    store = store_copy.path
+    (store / ".names" / "airl").write_bytes(b"\xff")
+    listed = irl("ls", "--store", store)
+    assert listed.code == 0 and store_copy.airl in listed.out
+    assert "warning: the name 'airl' is damaged" in listed.err
+    line = arguments("transfer --reward airl --ood 1.75x", store)
+    done = irl(*line)
+    assert_answered(done, 3, "'airl' is damaged")
+    hint = done.err.splitlines()[-1]
+    named = shlex.split(hint.partition("`")[2].partition("`")[0])[1:]
+    assert irl(*[store_copy.airl if word == "REF" else word for word in named]).code == 0
+    assert irl(*line, "--dry-run").code == 0
+
+
+def test_a_store_without_its_marker_says_how_to_mend_it(irl, store_copy):
+    marker = store_copy.path / "STORE"
+    marker.unlink()
+    done = irl(*arguments("ls", store_copy.path))
+    assert_answered(done, 4, "has no file STORE")
+    content, place = re.search(r"write (\{.*\}) to (.*)", done.err).groups()
+    assert place == str(marker)
+    marker.write_text(content)
+    assert irl(*arguments("ls", store_copy.path)).code == 0
+
+
+def test_lineage_names_what_is_not_in_the_store(irl, store_copy):
+    store = store_copy.path
+    shutil.rmtree(store / store_copy.airl)
+    missing = f"{store_copy.airl}  not in this store"
+    assert missing in irl("lineage", "moved", "--store", store).out
+    document = json.loads(irl("lineage", "moved", "--store", store, "--json").out)
+    assert [i["missing"] for i in document["inputs"]] == [store_copy.airl]
+
+
+def test_a_quick_verification_says_that_it_read_no_contents(irl, store_copy):
+    flip_last(store_copy.path / store_copy.airl / "reward.pt")
+    done = irl("verify", "--quick", "--store", store_copy.path)
+    assert done.code == 0 and "contents were not read" in done.out
+    full = irl("verify", "--store", store_copy.path)
+    assert full.code == 4 and "were not read" not in full.out
+
+
+@pytest.mark.parametrize(("days", "said"), [("7", True), ("0", False)])
+def test_gc_says_what_grace_keeps(irl, store_copy, days, said):
+    done = irl("gc", "--grace-days", days, "--store", store_copy.path)
+    assert done.code == 0 and ("younger than 7 days is kept" in done.err) == said
 
 
 def test_a_stage_that_fails_is_named(irl, tmp_path):

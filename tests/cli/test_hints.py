@@ -551,6 +551,7 @@ def test_a_lambda_meant_for_another_penalty_is_named(irl, smoke_store, words, wa
     line = ["train-airl", "--demos", "demos", *words, "--dry-run", *SMOKE]
     done = irl(*line, "--store", smoke_store.path)
     assert done.code == 0 and ("lambda 1 is outside the range of l2" in done.err) == warned
+    assert ("by --penalty-weight," in done.err) == warned
 
 
 @pytest.mark.parametrize(("words", "warned"), [([], True), (["--choose-penalty", "own"], False)])
@@ -567,3 +568,4 @@ def test_a_table_names_a_lambda_meant_for_another_penalty(irl, tmp_path, words, 
     ]
     done = irl(*line, *words, *SMOKE, "--store", tmp_path / "runs")
     assert done.code == 0 and ("outside the range of l2" in done.err) == warned
+    assert ("penalty_weights in a table" in done.err) == warned

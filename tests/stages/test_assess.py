@@ -71,6 +71,19 @@ def test_its_numbers_are_those_of_evaluations(assessed, irl):
         assert entry["learned"]["mean"] == pytest.approx(row["mean_learned_return"])
 
 
+@pytest.mark.parametrize("dry", [False, True])
+def test_a_damaged_reward_is_refused_before_the_bank_acts(irl, store_copy, dry):
+    path = store_copy.path / store_copy.airl / "reward.pt"
+    path.chmod(0o644)
+    data = path.read_bytes()
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    before = set(store_copy.path.iterdir())
+    done = irl("assess", "airl", "--store", store_copy.path, *SMOKE, *["--dry-run"][:dry])
+    assert done.code == 4 and store_copy.airl in done.err
+    now = set(store_copy.path.iterdir())
+    assert now == (before if dry else before - {path.parent})
+
+
 def test_epic_is_not_available_and_the_output_says_why(assessed, irl):
     path, document = assessed
     assessment = document["assessment"]
