@@ -357,15 +357,15 @@ def test_ctrl_c_in_a_pipeline_leaves_a_checkpoint_although_the_reader_died_of_it
 def test_a_step_whose_settings_changed_since_the_plan_is_not_made(runs, tmp_path, more):
     """What is changed takes effect in a new run; a tag must not mix two configs."""
     store, settings = tmp_path / "runs", tmp_path / "my.toml"
-    settings.write_text("[evaluation]\nepisodes = 3\n")
-    line = ("--settings", settings, "--tag", "a", "--until", "returns", *more)
+    settings.write_text("[demonstrations]\nepisodes = 3\n")
+    line = ("--settings", settings, "--tag", "a", "--until", "demos", *more)
     process = runs.start(store, *line, IRL_TEST_ROUND="0.2")
     runs.wait_for(lambda line: "computes" in line, process)
-    settings.write_text("[evaluation]\nepisodes = 77\n")
+    settings.write_text("[demonstrations]\nepisodes = 77\n")
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 2 and "has changed since the run was planned" in errors
     computed = map(json.loads, runs.computed())
-    assert not [p for p in computed if p.get("evaluation", {}).get("episodes") == 77]
+    assert not [step for step in computed if 77 in step.get("episodes", [])]
     # The artefact's own command makes it whatever has changed.
     stored = Store(store).index().artefacts.values()
     assert not any("--expect" in artefact.provenance()["command"] for artefact in stored)

@@ -125,7 +125,7 @@ def test_the_unbiased_estimate_has_the_right_mean_and_the_plain_one_is_biased(li
     truth = penalty(samples_of(x, theta), PLAIN).item()
     generator = torch.Generator().manual_seed(1)
     found = {True: [], False: []}
-    for _ in range(2000):
+    for _ in range(800):
         picks = torch.randint(B, (E, 2, 4), generator=generator)
         drawn = torch.gather(x, 2, picks[..., None].expand(-1, -1, -1, D))
         for unbiased, values in found.items():

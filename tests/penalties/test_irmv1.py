@@ -93,7 +93,7 @@ def test_unbiased_estimate_has_the_right_mean_and_the_square_is_biased(samples):
     population = (f - log_pi)[:1]
     truth = irmv1.scale_gradient(population, population).item() ** 2
     generator = torch.Generator().manual_seed(1)
-    repeats, size = 20_000, 4
+    repeats, size = 5000, 4
     picks = torch.randint(SHAPE[2], (repeats, 2, size), generator=generator)
     drawn = torch.gather(population.expand(repeats, 2, SHAPE[2]), 2, picks)
     unbiased = estimates(drawn, unbiased=True)
