@@ -37,9 +37,17 @@ def ls(
     names: dict[str, list[str]] = {}
     for name, id16 in store.names().items():
         names.setdefault(id16, []).append(name)
-    index, damage = _index_of(session, store)
+    damage: list[IntegrityError] = []
+    if isinstance(store, Store):
+        for name in store.damaged_names():
+            session.console.warn(f"the name {name!r} is damaged; `irl verify` says how to mend it")
+        index = store.index(damage.append)
+    else:
+        index = store.index()
+    for error in damage[:-1]:
+        session.console.warn(f"{error.message}; {error.hint}")
     if damage and session.as_json:
-        raise damage
+        raise damage[-1]
     stored = list(index.artefacts.values())
     makers = labels.makers(artefact.manifest for artefact in stored)
     found: list[dict[str, Any]] = [
@@ -66,31 +74,7 @@ def ls(
     if rows:
         out.print_table(["id", "stage", "about", "budget", "names"], rows)
     if damage:
-        raise damage
-
-
-def _index_of(session: Session, store: "Store | Remote") -> tuple[Index, IntegrityError | None]:
-    """The sound artefacts, and the error of a damaged one; all of these are in quarantine then.
-
-    Warns of damaged names, and of every damaged artefact but the last.
-
-    Raises:
-        IntegrityError: a damaged artefact cannot be moved to quarantine.
-    """
-    lost = store.damaged_names() if isinstance(store, Store) else ()
-    for name in lost:
-        session.console.warn(f"the name {name!r} is damaged; `irl verify` says how to mend it")
-    damage: IntegrityError | None = None
-    while True:
-        try:
-            return store.index(), damage
-        except IntegrityError as error:
-            if damage is not None:
-                # The same one again could not be moved.
-                if error.message == damage.message:
-                    raise
-                session.console.warn(f"{damage.message}; {damage.hint}")
-            damage = error
+        raise damage[-1]
 
 
 @store_command

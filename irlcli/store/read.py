@@ -119,14 +119,18 @@ def ids(layout: Layout) -> list[str]:
         return []
 
 
-def index(layout: Layout, warn: Callable[[str], None]) -> Index:
+def index(
+    layout: Layout,
+    warn: Callable[[str], None],
+    on_damage: Callable[[IntegrityError], None] | None = None,
+) -> Index:
     """All artefacts, each manifest read once.
 
     Artefacts of a newer schema are left out, each with a warning; in a read-only store, so are
-    damaged ones, which stay where they are.
+    damaged ones, which stay where they are. ``on_damage`` is given each error of a damaged one.
 
     Raises:
-        IntegrityError: as :func:`get`, unless the store is read-only.
+        IntegrityError: as :func:`get`, unless the store is read-only or ``on_damage`` is given.
     """
     artefacts, newer, damaged = {}, {}, []
     for id16 in ids(layout):
@@ -139,10 +143,13 @@ def index(layout: Layout, warn: Callable[[str], None]) -> Index:
             newer[id16] = (layout.root / id16 / MANIFEST).read_bytes()
             warn(f"skipping artefact {id16}: {error.message}; {error.hint}")
         except IntegrityError as error:
-            if not layout.read_only:
+            if layout.read_only:
+                damaged.append(id16)
+                warn(f"skipping an artefact of the store {layout.root}: {error.message}")
+            elif on_damage is None:
                 raise
-            damaged.append(id16)
-            warn(f"skipping an artefact of the store {layout.root}: {error.message}")
+            else:
+                on_damage(error)
     return Index(artefacts, newer, damaged)
 
 

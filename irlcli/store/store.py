@@ -124,9 +124,9 @@ class Store:
         """The ids of all artefacts, sorted."""
         return read.ids(self._layout)
 
-    def index(self) -> Index:
+    def index(self, on_damage: Callable[[IntegrityError], None] | None = None) -> Index:
         """All artefacts: see :func:`irlcli.store.read.index`."""
-        self._index = read.index(self._layout, self.warn)
+        self._index = read.index(self._layout, self.warn, on_damage)
         return self._index
 
     def artefacts(self) -> Iterator[Artefact]:
