@@ -263,27 +263,27 @@ def _without_reward(requests: _RowRequests, measures: Sequence[str]) -> Iterator
     held_out, setting = has_held_out(measures), str(unseen[0])
     if held_out:
         for agent in ("random", "idle"):
-            cell = requests.cell(agent, "ood", place=setting)
+            cell = requests.cell(agent, "ood", setting=setting)
             request = requests.returns(unseen, None, agent)
             yield Task(f"{row}.{agent}-returns", "returns", request, cell)
         name, request = requests.own_returns(unseen[0])
-        yield Task(name, "returns", request, requests.cell("expert", "ood", place=setting))
-    places = {"ood": unseen} if held_out else {}
+        yield Task(name, "returns", request, requests.cell("expert", "ood", setting=setting))
+    measured = {"ood": unseen} if held_out else {}
     in_distribution = not set(IN_DISTRIBUTION).isdisjoint(measures)
     if in_distribution:
-        places["id"] = trained
+        measured["id"] = trained
     for e in trained:
         expert, label = requests.expert(e), f"expert of {e}"
         if in_distribution:
             name, request = requests.own_returns(e)
-            yield Task(name, "returns", request, requests.cell("expert", "id", place=str(e)))
+            yield Task(name, "returns", request, requests.cell("expert", "id", setting=str(e)))
         # If one expert demonstrates in every setting, reusing it would repeat the setting's own.
         if expert == requests.expert(unseen[0]):
             continue
-        for measure, settings in places.items():
+        for measure, settings in measured.items():
             name = f"{row}.expert.{_value(e)}.reused{'-id' * (measure == 'id')}-returns"
             request = requests.returns(settings, expert, policy_label=label)
-            yield Task(name, "returns", request, requests.cell("reused", measure, place=str(e)))
+            yield Task(name, "returns", request, requests.cell("reused", measure, setting=str(e)))
 
 
 def _run(
@@ -477,7 +477,7 @@ def experts(row: Row, config_of: ConfigOf) -> Iterator[Task]:
             yield Task(name, "returns", request, requests.cell(agent, measure))
         for setting in settings:
             name, request = requests.own_returns(setting)
-            cell = requests.cell("expert", measure, place=str(setting))
+            cell = requests.cell("expert", measure, setting=str(setting))
             yield Task(name, "returns", request, cell, {EXPERT_LEARNING: requests.expert(setting)})
 
 

@@ -181,7 +181,7 @@ def without_effect(p: Parameters) -> list[str]:
         for variant in p.variants:
             cells = p.cells_of(row.name, variant.name)
             if cells and all(c.run for c in cells):
-                runs.setdefault(frozenset((c.run, c.place, c.seed) for c in cells), []).append(
+                runs.setdefault(frozenset((c.run, c.setting, c.seed) for c in cells), []).append(
                     variant.name
                 )
         result += [

@@ -51,7 +51,7 @@ def _waiting(cell: Cell) -> str:
 
 
 def _which(cell: Cell) -> str:
-    return cell.place if cell.seed is None else str(cell.seed)
+    return cell.setting if cell.seed is None else str(cell.seed)
 
 
 def not_imitated(cells: pd.DataFrame) -> list[str]:

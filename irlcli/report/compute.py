@@ -81,7 +81,9 @@ def whole_seeds(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
     """
     unseen = {row.name: row.unseen for row in p.rows}
     lacking = {
-        (c.row, c.agent, c.measure, c.place or unseen[c.row], c.seed) for c in p.cells if not c.run
+        (c.row, c.agent, c.measure, c.setting or unseen[c.row], c.seed)
+        for c in p.cells
+        if not c.run
     }
     columns = ["row", "agent", "measure", "setting", "seed"]
     kept = [key not in lacking for key in points[columns].itertuples(index=False, name=None)]

@@ -50,14 +50,14 @@ def summarise(
             continue
         env, knob = cell.env, cell.knob
         expert, idle, random = (
-            summaries.get((agent, env, cell.place)) for agent in ("expert", "idle", "random")
+            summaries.get((agent, env, cell.setting)) for agent in ("expert", "idle", "random")
         )
         trained = [runs[i] for i in runs[cell.run].inputs if i in runs] if cell.run else []
         rows.append(
             {
                 "env": env,
                 "knob": knob,
-                "setting": cell.place,
+                "setting": cell.setting,
                 "use": _USES[cell.measure],
                 "true_return": _value(expert, "mean_return"),
                 "std_return": _value(expert, "std_return"),
@@ -103,7 +103,7 @@ def text_table(found: pd.DataFrame) -> Table:
 def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
     """Experts that do not reach the bar of their row, and missing ones."""
     experts = [cell for cell in cells if cell.agent == "expert"]
-    missing = [f"{cell.env} {cell.place}" for cell in experts if not cell.run]
+    missing = [f"{cell.env} {cell.setting}" for cell in experts if not cell.run]
     low = [
         f"{row.env} {row.setting} ({row.true_return:.0f} of {bar:.0f})"
         for row in found.itertuples()
@@ -164,14 +164,14 @@ def _panel(axis: Axes, title: str, name: str, experts: Sequence[tuple[Cell, pd.D
         return
     for cell, metrics in experts:
         style = "-" if cell.measure == "id" else "--"
-        axis.plot(metrics["steps"] / 1e6, metrics[name], style, lw=1.2, label=cell.place)
+        axis.plot(metrics["steps"] / 1e6, metrics[name], style, lw=1.2, label=cell.setting)
     axis.set_title(title, loc="left", size=8)
     axis.set_xlabel("million steps")
     axis.grid(alpha=0.25)
 
 
-def _value(place: Any, name: str) -> float | None:
-    return None if place is None else getattr(place, name)
+def _value(measured: Any, name: str) -> float | None:
+    return None if measured is None else getattr(measured, name)
 
 
 def _text(value: Any) -> str:

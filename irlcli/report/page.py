@@ -213,8 +213,8 @@ def _lineage(p: Parameters) -> str:
         if cell.run:
             seed = "" if cell.seed is None else f", seed {cell.seed}"
             seed += f", retraining {cell.retraining}" if cell.retraining else ""
-            place = f", {cell.place}" if cell.place else ""
-            heading = f"{cell.row}, {title(cell.agent)}, {cell.measure}{place}{seed}"
+            setting = f", {cell.setting}" if cell.setting else ""
+            heading = f"{cell.row}, {title(cell.agent)}, {cell.measure}{setting}{seed}"
             tree = escape("\n".join(_tree(p, cell.run)))
             parts.append(
                 f"<details><summary>{escape(heading)}</summary><pre>{tree}</pre></details>"

@@ -45,13 +45,13 @@ class Cell(msgspec.Struct, frozen=True):
         agent: a method, ``expert``, ``random``, ``idle``, or ``reused``: the expert of a training
             setting, evaluated in the other settings in which the students are evaluated.
         measure: ``transfer`` (the retrained policy), ``from-student`` (retrained from the student
-            on), ``transfer-id`` (retrained in a training setting, ``place``), ``zero-shot`` or
+            on), ``transfer-id`` (retrained in a training setting, ``setting``), ``zero-shot`` or
             ``id`` (the student, in the held-out setting or in distribution), ``ood`` for an agent
             without a reward, ``expert by reward``: the held-out setting's expert, scored by this
             seed's reward, ``assess``: the reward itself, measured on a bank of policies, or
             ``cue``: how it depends on a cue.
         seed: of the reward learning; None for agents without one.
-        place: the setting in which an expert was trained, or in which another agent is evaluated.
+        setting: that in which an expert was trained, or in which another agent is evaluated.
         run: id of the evaluation; empty if it is missing.
         why: what a missing one waits for.
         retraining: number of the policy trained on this seed's reward, from 0.
@@ -61,7 +61,7 @@ class Cell(msgspec.Struct, frozen=True):
     agent: str
     measure: str
     seed: int | None = None
-    place: str = ""
+    setting: str = ""
     run: str = ""
     why: str = ""
     retraining: int = 0
@@ -80,13 +80,13 @@ class Cell(msgspec.Struct, frozen=True):
     def role(self) -> str:
         """Name of the evaluation among the stage's inputs."""
         seed = "-" if self.seed is None else self.seed
-        text = f"{self.row} {self.agent} {seed} {self.measure} {self.place}".strip()
+        text = f"{self.row} {self.agent} {seed} {self.measure} {self.setting}".strip()
         return f"{text} retraining {self.retraining}" if self.retraining else text
 
     def curve_role(self, part: str) -> str:
         """The role of the metrics of training behind it; an expert's have no part of a reward's run."""
         if self.agent == "expert":
-            return f"{self.env} {self.place} {part}"
+            return f"{self.env} {self.setting} {part}"
         assert self.seed is not None
         return curve_role(self.row, self.agent, self.seed, part)
 

@@ -104,20 +104,20 @@ def _points(job: Job) -> list[dict[str, Any]]:
                 "measure": cell.measure,
                 "seed": cell.seed,
                 "retraining": cell.retraining,
-                "expert_of": cell.place if of_expert else "",
-                "setting": place.setting,
-                "true_return": place.mean_return,
-                "progress": place.mean_progress,
-                "learned_return": place.mean_learned_return if scored else None,
-                "regret_error": errors.get((place.setting, "true_return")),
-                "gap_error": errors.get((place.setting, "learned_return")),
-                "episodes": place.episodes,
+                "expert_of": cell.setting if of_expert else "",
+                "setting": measured.setting,
+                "true_return": measured.mean_return,
+                "progress": measured.mean_progress,
+                "learned_return": measured.mean_learned_return if scored else None,
+                "regret_error": errors.get((measured.setting, "true_return")),
+                "gap_error": errors.get((measured.setting, "learned_return")),
+                "episodes": measured.episodes,
                 "evaluation": cell.run,
                 "demonstrations": " ".join(demonstrations(job.parameters, [cell])),
             }
-            for place in summary.settings
+            for measured in summary.settings
             # In its own setting an expert is what the others are compared with, not a baseline.
-            if cell.agent != "reused" or place.setting != cell.place
+            if cell.agent != "reused" or measured.setting != cell.setting
         ]
     return points
 
@@ -166,7 +166,7 @@ def _episodes(job: Job) -> caveats.Episodes:
         returns = pd.read_parquet(path, columns=["true_return"])
         group = episodes.setdefault((cell.row, cell.measure), {})
         which = f"{cell.seed}"
-        which += f" in {cell.place}" if cell.place else ""
+        which += f" in {cell.setting}" if cell.setting else ""
         which += f" retraining {cell.retraining}" if cell.retraining else ""
         # Variants share whole runs by design; only different runs can be suspiciously equal.
         if not p.variants or (cell.row, cell.run) not in shared:

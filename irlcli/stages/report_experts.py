@@ -19,7 +19,7 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
         command: the command line that produces this report; printed in it.
         steps: the budget of an expert, by row: ``ENV KNOB``.
         bars: the least mean true return of an expert, by row that has a bar.
-        cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``; each ``place`` is a setting.
+        cells: rows are ``ENV KNOB``; measures are ``id`` and ``ood``.
         runs: provenance of the artefacts, by id.
         libraries: the sets of library versions that occur, by a short name.
     """
@@ -56,8 +56,8 @@ def run(job: Job) -> None:
         if cell.run:
             path = job.inputs[cell.role] / "summary.json"
             summary = descriptions.parse(read_json(path), descriptions.Evaluation, path)
-            for place in summary.settings:
-                summaries[cell.agent, summary.policy.env, place.setting] = place
+            for measured in summary.settings:
+                summaries[cell.agent, summary.policy.env, measured.setting] = measured
     learning = {
         role: pd.read_parquet(path)
         for role, path in job.inputs.items()

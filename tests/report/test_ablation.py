@@ -34,8 +34,8 @@ def ablation(returns, experts=EXPERTS, method="erm", shared=()):
             else runs.setdefault((owner, measure, setting, seed, retraining), own)
         )
         why = "" if run else "no result of transfer"
-        place = setting if measure == "transfer-id" else ""
-        cells.append(Cell(BOUNCE, agent, measure, seed, place, run, why, retraining))
+        where = setting if measure == "transfer-id" else ""
+        cells.append(Cell(BOUNCE, agent, measure, seed, where, run, why, retraining))
         if run:
             point = {"row": BOUNCE, "agent": agent, "measure": measure, "seed": seed}
             point |= {"retraining": retraining, "setting": setting, "true_return": value}

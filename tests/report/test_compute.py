@@ -316,9 +316,9 @@ def test_a_seed_without_all_evaluations_is_not_compared():
     cells, points = [], []
     for agent, lacking in (("erm", {2, 3}), ("irm", set())):
         for seed in range(4):
-            for place, value in (("bounce=0.1", 100.0), ("bounce=0.5", 300.0)):
-                run = "" if seed in lacking and place == "bounce=0.5" else f"{len(points):016x}"
-                cells.append(Cell(BOUNCE, agent, "transfer-id", seed, place=place, run=run))
+            for setting, value in (("bounce=0.1", 100.0), ("bounce=0.5", 300.0)):
+                run = "" if seed in lacking and setting == "bounce=0.5" else f"{len(points):016x}"
+                cells.append(Cell(BOUNCE, agent, "transfer-id", seed, setting=setting, run=run))
                 if run:
                     of = {"row": BOUNCE, "agent": agent, "measure": "transfer-id", "seed": seed}
                     points.append(of | {"true_return": value + seed, "progress": None})

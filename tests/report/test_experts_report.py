@@ -11,9 +11,9 @@ from irlcli.report.parameters import Cell
 
 ROW = "lunar-lander bounce"
 CELLS = (
-    Cell(ROW, "random", "id", place="", run="r"),
-    Cell(ROW, "expert", "id", place="bounce=0.1", run="a"),
-    Cell(ROW, "expert", "ood", place="bounce=0.9", why="no result of train-expert"),
+    Cell(ROW, "random", "id", setting="", run="r"),
+    Cell(ROW, "expert", "id", setting="bounce=0.1", run="a"),
+    Cell(ROW, "expert", "ood", setting="bounce=0.9", why="no result of train-expert"),
 )
 RUNS = {"a": run_of(0, inputs=("e",)), "e": run_of(1, "train-expert"), "r": run_of(2)}
 

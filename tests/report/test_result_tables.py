@@ -60,7 +60,7 @@ def test_missing_seeds_are_counted():
 def test_a_mean_over_some_of_the_settings_is_marked_beside_the_missing_seeds():
     values = complete() | {(BOUNCE, "irm", "id"): [5.0, None, None]}
     parameters, points = example(values)
-    lacking = Cell(BOUNCE, "irm", "id", 0, place="another", why="no result of evaluate")
+    lacking = Cell(BOUNCE, "irm", "id", 0, setting="another", why="no result of evaluate")
     parameters = msgspec.structs.replace(parameters, cells=(*parameters.cells, lacking))
     found = table(build(parameters, points, {}, {}), "In distribution").rows[0][3]
     assert found.startswith("5.0 (1/3) (part)")

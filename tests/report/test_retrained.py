@@ -116,7 +116,7 @@ def test_measures_in_distribution_stand_beside_the_training_settings_experts():
     assert found["of_expert"] == 0.5 and pd.isna(found["imitated"])
     missing = [c for c in p.cells if (c.agent, c.measure) == ("erm", "transfer-id")]
     part = msgspec.structs.replace(
-        missing[0], run="", place="bounce=0.5", why="no result of transfer"
+        missing[0], run="", setting="bounce=0.5", why="no result of transfer"
     )
     p = msgspec.structs.replace(p, cells=(*p.cells, part))
     assert pd.isna(cell(build(p, points, {}, {}), BOUNCE, "erm", "transfer-id")["of_expert"])
