@@ -48,6 +48,13 @@ def ls(
         session.console.warn(f"{error.message}; {error.hint}")
     if damage and session.as_json:
         raise damage[-1]
+    if source is None:
+        ids = {*index.artefacts, *index.newer}
+        lost = [name for id16 in names.keys() - ids for name in names[id16]]
+        if lost:
+            session.console.warn(
+                f"names of missing artefacts: {', '.join(sorted(lost))}; `irl verify` says more"
+            )
     stored = list(index.artefacts.values())
     makers = labels.makers(artefact.manifest for artefact in stored)
     found: list[dict[str, Any]] = [

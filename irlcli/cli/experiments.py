@@ -348,7 +348,8 @@ def _report(
     directory: Path | None,
     outcome: "Outcome",
 ) -> None:
-    plan.lookup.forget_missing()
+    # A step that failed may have moved a damaged artefact to quarantine.
+    plan.lookup.forget()
     try:
         request = report_of(session, choice, plan)
     except NotFound:
@@ -388,7 +389,7 @@ def _raise_for(outcome: "Outcome", plan: "Plan", continue_hint: str) -> None:
         again = "run the same command again: finished steps are kept"
         error = StageFailed(
             f"{len(outcome.failed)} of {total} steps failed: {names}{waiting}",
-            again if outcome.exit_code in (75, 130) else f"fix the problem and {again}",
+            again if outcome.exit_code in (4, 75, 130) else f"fix the problem and {again}",
             {
                 "failed": {name: failure._asdict() for name, failure in outcome.failed.items()},
                 "blocked": outcome.blocked,

@@ -121,8 +121,7 @@ def _naming(session: Session) -> str:
 
 
 def _print_command(id16: str, command: str) -> None:
-    if command:
-        out.print_note(f"{id16}: made by: {command}")
+    out.print_note(f"{id16}: made by: {command or 'a command whose record is lost'}")
 
 
 @gc_command

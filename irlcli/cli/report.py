@@ -26,7 +26,7 @@ from irlcli.cli.table_report import (
 )
 from irlcli.envs.registry import ENVIRONMENTS
 from irlcli.errors import UsageError
-from irlcli.requests.tables import TableChoice, open_plan
+from irlcli.requests.tables import TableChoice, open_plan, warn_of_lost_results
 from irlcli.store import Artefact
 
 # What every report takes.
@@ -109,6 +109,7 @@ def _table(
     from irlcli.experiments.tables import REPORTS
 
     plan = open_plan(session, chosen, REPORTS)
+    warn_of_lost_results(plan, session.console.warn)
     if directory is not None:
         check_out(directory, session.store.root, plan.table)
     request = report_of(session, chosen, plan)

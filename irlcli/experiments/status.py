@@ -29,6 +29,7 @@ class Step(NamedTuple):
         artefact: of a HIT or FOUND; the latter lies in the other store.
         key: unknown while an input is missing.
         parameters: the request's, every one resolved.
+        damaged: whether its artefact is there, but damaged.
     """
 
     status: Status
@@ -37,6 +38,7 @@ class Step(NamedTuple):
     artefact: Artefact | None = None
     key: str | None = None
     parameters: Any = None
+    damaged: bool = False
 
 
 class Identities:
@@ -109,6 +111,10 @@ class Lookup:
         found = self._elsewhere.get(step.key) if step.status == "FOUND" and step.key else None
         return (self.store if found is None else found.store).file(step.artefact, path)
 
+    def forget(self) -> None:
+        """Look again for everything."""
+        self._steps.clear()
+
     def forget_missing(self) -> None:
         """Look again for everything that was not in the store."""
         self._steps = {i: kept for i, kept in self._steps.items() if kept[1].status == "HIT"}
@@ -144,6 +150,7 @@ class Lookup:
                 f"{there.problem}: the next run moves it to quarantine and exits with 4; "
                 "run again to compute it",
                 key=key,
+                damaged=True,
             )
         found = self._find_elsewhere(key)
         if found is not None:

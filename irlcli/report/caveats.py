@@ -98,8 +98,8 @@ def weak_experts(
         if better:
             listed = " and ".join(f"{agents} ({earned:.1f})" for agents, earned in better.items())
             found.append(
-                f"Weak expert: {row.name}: in {row.unseen} its own expert earns {expert:.1f}, less than "
-                f"{listed}. It may not be the best policy known."
+                f"Expert not the best: {row.name}: in {row.unseen} it earns {expert:.1f}, less than "
+                f"{listed}."
             )
     return found
 

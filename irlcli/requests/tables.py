@@ -266,6 +266,14 @@ def warn_of_damage(plan: "Plan", warn: Callable[[str], None]) -> None:
         _other_versions(plan.step(name), warn)
 
 
+def warn_of_lost_results(plan: "Plan", warn: Callable[[str], None]) -> None:
+    """Tell ``warn`` of damaged artefacts: a report counts them as missing."""
+    for name in plan.tasks:
+        step = plan.step(name)
+        if step.damaged:
+            warn(f"{name} is damaged: {step.why}")
+
+
 def _other_versions(step: "Step", warn: Callable[[str], None]) -> list[str]:
     from irlcli.experiments import provenance
 

@@ -20,6 +20,8 @@ from irlcli.store.manifest import (
     read_provenance,
 )
 
+LOST_COMMAND = "the command that made it, whose record is lost,"
+
 
 class Artefact(NamedTuple):
     """A published artefact: its directory and its manifest."""
@@ -54,10 +56,8 @@ class Artefact(NamedTuple):
             return read_provenance(self.directory, self.manifest.id)
         except IntegrityError as error:
             line = shlex.join(["irl", "verify", self.id, "--store", str(self.directory.parent)])
-            raise IntegrityError(
-                error.message,
-                f"`{line}` moves the artefact to quarantine and prints the command that makes it again",
-            ) from None
+            hint = f"its outputs may be sound; `{line}` moves it to quarantine, and {LOST_COMMAND}"
+            raise IntegrityError(error.message, f"{hint} makes it again") from None
 
 
 class Published(NamedTuple):
@@ -123,6 +123,12 @@ def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[s
     places = provenance.get("inputs") or {}
     texts = [places.get(role, "").partition("/") for role in roles]
     return [id16 for id16, slash, _ in texts if slash and is_id(id16)]
+
+
+def repair_hint(directory: Path, layout: Layout) -> str:
+    """How to make a damaged artefact again, in the store ``layout``."""
+    command = recorded_command(directory, layout)
+    return f"compute it again: {command}" if command else f"{LOST_COMMAND} makes it again"
 
 
 def recorded_command(directory: Path, layout: Layout) -> str:

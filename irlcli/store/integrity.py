@@ -12,6 +12,7 @@ from irlcli.store.artefact import (
     output_problem,
     read_artefact,
     recorded_command,
+    repair_hint,
 )
 from irlcli.store.index import Index
 from irlcli.store.layout import Layout, claims
@@ -116,8 +117,7 @@ def verify(layout: Layout, ids: Iterable[str], quick: bool) -> Verified:
 def damaged(layout: Layout, directory: Path, problem: str) -> IrlError:
     """The error to raise for a damaged artefact, after moving it to quarantine."""
     name = f"artefact {directory.name}"
-    command = recorded_command(directory, layout)
-    hint = f"compute it again: {command}" if command else "compute it again"
+    hint = repair_hint(directory, layout)
     try:
         directory.lstat()
         if layout.read_only:

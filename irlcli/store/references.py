@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from irlcli.errors import NotFound, UsageError, closest
-from irlcli.store.artefact import Artefact, recorded_command
+from irlcli.store.artefact import Artefact, repair_hint
 from irlcli.store.durable import fsync_directory, temporary_file, write_durably
 from irlcli.store.layout import (
     DEFAULT_ROOT,
@@ -90,7 +90,9 @@ def _unknown(layout: Layout, ref: str, text: str) -> NotFound:
     head = text.partition("/")[0]
     if head in damaged_names(layout):
         naming = shlex.join(["irl", "name", "REF", head, *layout.option])
-        return NotFound(f"the name {head!r} is damaged", f"name the artefact again: `{naming}`")
+        return NotFound(
+            f"the name {head!r} is damaged", f"name it again: `{naming}`; {layout.listing}"
+        )
     if is_prefix(head) and quarantined(layout, head) is not None:
         return _missing(layout, f"artefact {head}", head)
     listing = f"{layout.listing}, `{pull}` copies one from another store"
@@ -135,11 +137,7 @@ def _missing(layout: Layout, subject: str, id16: str) -> NotFound:
             f"{subject} is missing",
             "name another artefact with `irl name`",
         )
-    command = recorded_command(place, layout)
-    return NotFound(
-        f"{subject} was damaged and is now in {place}",
-        f"compute it again: {command}" if command else "compute it again",
-    )
+    return NotFound(f"{subject} was damaged and is now in {place}", repair_hint(place, layout))
 
 
 def _by_prefix(layout: Layout, prefix: str) -> Artefact | None:

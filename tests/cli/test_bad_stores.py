@@ -363,6 +363,22 @@ def test_ls_lists_what_is_sound_beside_the_damaged(irl, store_copy):
     assert store_copy.airl in done.out and store_copy.transfer not in done.out
     again = irl("ls", "--store", store)
     assert (again.code, again.out) == (0, done.out)
+    assert "warning: names of missing artefacts: moved, score; " in again.err
+
+
+@pytest.mark.parametrize("file", ["provenance.json", "manifest.json"])
+def test_the_hint_of_a_lost_file_does_not_promise_more_than_there_is(irl, store_copy, file):
+    """The provenance holds the command that makes the artefact again."""
+    lost = file == "provenance.json"
+    (store_copy.path / store_copy.airl / file).unlink()
+    first = irl(*arguments("show airl", store_copy.path))
+    assert first.code == 4 and ("whose record is lost" in first.err) == lost
+    verified = irl(*arguments("verify", store_copy.path))
+    assert ("made by: a command whose record is lost" in verified.err) == lost
+    after = irl(*arguments("show airl", store_copy.path))
+    hint = after.err.splitlines()[-1]
+    assert after.code == 3
+    assert ("whose record is lost" in hint) == lost and ("irl train-airl" in hint) != lost
 
 
 def test_a_damaged_name_is_named(irl, store_copy):

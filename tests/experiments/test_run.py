@@ -518,6 +518,15 @@ def test_a_table_end_to_end(irl, smoke_store, tmp_path):
     assert "11 of 11 steps exist" in second.err
     assert loaded_by("run", *map(str, words)) == "LOADED []"
 
+    # The reward's policy is damaged, and what was measured of it is lost.
+    policy = made.resolve(f"{ROW}.irm.0").artefact.directory / "policy.pt"
+    policy.chmod(0o644)
+    policy.write_bytes(policy.read_bytes()[:-1] + b"x")
+    shutil.rmtree(made.resolve(f"{ROW}.irm.0.zero-shot-returns").artefact.directory)
+    failed = irl("run", *words[:-2])
+    assert failed.code == 4 and f"error: 1 of 11 steps failed: {ROW}.irm.0" in failed.err
+    assert failed.err.splitlines()[-1].startswith("hint: run the same command again")
+
 
 def test_a_copy_does_not_wait_for_a_process_that_works_on_the_same_artefact(smoke_store, tmp_path):
     """It may take hours, and `irl run` would not answer Ctrl-C meanwhile."""

@@ -231,6 +231,15 @@ def test_the_learning_curve_of_a_retrained_policy_is_that_of_the_restart_kept(
     pd.testing.assert_frame_equal(curve, metrics[metrics["kept"]])
 
 
+def test_a_damaged_evaluation_is_named_and_not_called_missing_only(report, table_store, tmp_path):
+    store = shutil.copytree(table_store, tmp_path / "runs", symlinks=True)
+    path = Store(store).resolve("erm.1.zero").artefact.directory / "summary.json"
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes() + b" ")
+    done = report("table1", store, *ROW)
+    assert done.code == 0 and "engine-power.erm.1.zero-shot-returns is damaged: " in done.err
+
+
 def test_what_is_missing_is_said(report, table_store):
     done = report("table1", table_store, *ROW)
     said = caveats(done)
