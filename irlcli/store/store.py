@@ -333,10 +333,21 @@ class Store:
         return problems(self._layout, id16, quick)
 
     def verify(self, ids: Iterable[str], quick: bool = False) -> Verified:
-        """Check artefacts: see :func:`irlcli.store.integrity.verify`."""
-        from irlcli.store.integrity import verify
+        """Check artefacts: see :func:`irlcli.store.integrity.verify`.
 
-        return verify(self._layout, ids, quick)
+        A sound artefact whose key points to nothing holds it again, with a warning: otherwise it would
+        be computed once more.
+        """
+        from irlcli.store.integrity import verify
+        from irlcli.store.publish import claim
+
+        verified = verify(self._layout, ids, quick)
+        if not self._layout.read_only:
+            for artefact in verified.sound.artefacts.values():
+                if read.held_by(self._layout, artefact.manifest.record.key) is None:
+                    claim(self._layout, artefact)
+                    self.warn(f"artefact {artefact.id} had lost its key and holds it again")
+        return verified
 
     # Collection
 

@@ -366,6 +366,21 @@ def test_ls_lists_what_is_sound_beside_the_damaged(irl, store_copy):
     assert "warning: names of missing artefacts: moved, score; " in again.err
 
 
+@pytest.mark.parametrize("content", [None, "zzz"])
+def test_verify_restores_a_lost_key(irl, store_copy, content):
+    key = Store(store_copy.path).resolve("moved").artefact.manifest.record.key
+    pointer = store_copy.path / ".keys" / key
+    pointer.unlink()
+    if content is not None:
+        pointer.write_text(content)
+    line = arguments("transfer --reward airl --ood 1.5x --dry-run", store_copy.path)
+    assert irl(*line).out.startswith("RUN")
+    done = irl(*arguments("verify", store_copy.path))
+    assert done.code == 0 and f"artefact {store_copy.transfer} had lost its key" in done.err
+    assert irl(*line).out.startswith("HIT")
+    assert irl(*arguments("verify", store_copy.path)).err == ""
+
+
 @pytest.mark.parametrize("file", ["provenance.json", "manifest.json"])
 def test_the_hint_of_a_lost_file_does_not_promise_more_than_there_is(irl, store_copy, file):
     """The provenance holds the command that makes the artefact again."""
