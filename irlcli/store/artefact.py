@@ -20,8 +20,6 @@ from irlcli.store.manifest import (
     read_provenance,
 )
 
-LOST_COMMAND = "the command that made it, whose record is lost,"
-
 
 class Artefact(NamedTuple):
     """A published artefact: its directory and its manifest."""
@@ -56,8 +54,9 @@ class Artefact(NamedTuple):
             return read_provenance(self.directory, self.manifest.id)
         except IntegrityError as error:
             line = shlex.join(["irl", "verify", self.id, "--store", str(self.directory.parent)])
-            hint = f"its outputs may be sound; `{line}` moves it to quarantine, and {LOST_COMMAND}"
-            raise IntegrityError(error.message, f"{hint} makes it again") from None
+            hint = f"its outputs may be sound; `{line}` moves it to quarantine; then "
+            again = repair_hint(self.directory, Layout(self.directory.parent))
+            raise IntegrityError(error.message, hint + again) from None
 
 
 class Published(NamedTuple):
@@ -128,7 +127,8 @@ def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[s
 def repair_hint(directory: Path, layout: Layout) -> str:
     """How to make a damaged artefact again, in the store ``layout``."""
     command = recorded_command(directory, layout)
-    return f"compute it again: {command}" if command else f"{LOST_COMMAND} makes it again"
+    how = command or "the command that made it, whose record is lost"
+    return f"compute it again: {how}"
 
 
 def recorded_command(directory: Path, layout: Layout) -> str:

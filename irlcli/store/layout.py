@@ -100,7 +100,7 @@ def store_around(path: Path) -> Path | None:
     return next((root for root in around if Layout(root).marker.is_file()), None)
 
 
-def _whole(layout: Layout) -> str:
+def _marker_hint(layout: Layout) -> str:
     """How to mend the file by which a store is known."""
     return f"""if this is a store of irlcli, write {{"format": {FORMAT}}} to {layout.marker}"""
 
@@ -125,10 +125,12 @@ def check(layout: Layout) -> None:
         try:
             value = read_json(marker)
         except IntegrityError as error:
-            raise IntegrityError(error.message, _whole(layout)) from None
+            raise IntegrityError(error.message, _marker_hint(layout)) from None
         version = value.get("format") if isinstance(value, dict) else None
         if type(version) is not int or version < 1:
-            raise IntegrityError(f"{marker} does not contain a format version", _whole(layout))
+            raise IntegrityError(
+                f"{marker} does not contain a format version", _marker_hint(layout)
+            )
         if version > FORMAT:
             raise IntegrityError(
                 f"{root} is a store of format {version}, newer than the supported {FORMAT}",
@@ -143,7 +145,7 @@ def check(layout: Layout) -> None:
             # Another process created the store meanwhile.
             return check(layout)
         if any(path.is_dir() for path in (layout.locks, layout.names)):
-            raise IntegrityError(f"the store {root} has no file STORE", _whole(layout))
+            raise IntegrityError(f"the store {root} has no file STORE", _marker_hint(layout))
         raise UsageError(
             f"{root} contains files but is not a store",
             "name a store" if layout.read_only else "name a store, or an empty or new directory",

@@ -345,8 +345,13 @@ class Store:
         if not self._layout.read_only:
             for artefact in verified.sound.artefacts.values():
                 if read.held_by(self._layout, artefact.manifest.record.key) is None:
-                    claim(self._layout, artefact)
-                    self.warn(f"artefact {artefact.id} had lost its key and holds it again")
+                    lost = f"artefact {artefact.id} had lost its key"
+                    try:
+                        claim(self._layout, artefact)
+                    except OSError as error:
+                        self.warn(f"{lost}, which cannot be restored ({error.strerror})")
+                    else:
+                        self.warn(f"{lost} and holds it again")
         return verified
 
     # Collection
