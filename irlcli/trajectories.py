@@ -72,6 +72,15 @@ class Trajectory:
         return float(self.rewards.sum())
 
 
+def counted(episodes: Sequence[Trajectory]) -> Sequence[Trajectory]:
+    """Those of a policy's ``episodes`` over which its means are taken.
+
+    An episode that an error stopped lacks the rewards of its other steps. Where these are negative it
+    would look like a success, so it counts only if an error stopped all of them.
+    """
+    return [episode for episode in episodes if episode.error is None] or episodes
+
+
 @dataclass(frozen=True, eq=False)
 class Transitions:
     """B transitions (s, a, s'), stacked over episodes.

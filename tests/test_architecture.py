@@ -1,6 +1,7 @@
 """The import rules of the design, read from the source, and what light commands leave unloaded."""
 
 import ast
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -247,6 +248,14 @@ def test_a_hit_loads_nothing_heavy(tmp_path):
     light = loaded_by("ls", "--store", str(tmp_path / "runs"), among={"msgspec", "tomllib"})
     assert light == "LOADED []"
     assert loaded_by("verify", "--store", str(tmp_path / "runs")) == "LOADED []"
+
+
+def test_an_evaluation_loads_no_compiler(smoke_store, tmp_path):
+    """Importing PyTorch's takes longer than the episodes of a short evaluation."""
+    store = str(shutil.copytree(smoke_store.path, tmp_path / "runs", symlinks=True))
+    command = ["evaluate", "--policy", "moved", "--episodes", "1", "--store", store]
+    modules = {"torch", "torch._dynamo"}
+    assert loaded_by(*command, "--profile", "smoke", among=modules) == "LOADED ['torch']"
 
 
 def test_nothing_is_unfinished():

@@ -9,7 +9,7 @@ from irlcli.report.returns import EvaluationRun, rows
 def print_rows(evaluations: Sequence[EvaluationRun], stderr: bool = False) -> None:
     """A table row for each agent and setting."""
     columns = ["agent", "setting", "true return", "sd over seeds", "progress", "learned return"]
-    columns += ["seeds", "episodes each"]
+    columns += ["seeds", "episodes each", "stopped by an error"]
     table = [
         [
             row.agent,
@@ -20,7 +20,9 @@ def print_rows(evaluations: Sequence[EvaluationRun], stderr: bool = False) -> No
             number(row.learned),
             str(len(row.returns)),
             str(row.episodes),
+            str(row.stopped or "-"),
         ]
         for row in rows(evaluations)
     ]
-    print_table(columns, table, stderr=stderr, optional=("progress", "learned return"))
+    optional = ("progress", "learned return", "stopped by an error")
+    print_table(columns, table, stderr=stderr, optional=optional)

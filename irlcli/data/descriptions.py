@@ -194,10 +194,14 @@ class Subject(Struct, frozen=True, kw_only=True):
 
 
 class Returns(Struct, frozen=True, kw_only=True):
-    """Mean returns in one setting; the learned return is the mean of g / scale per episode."""
+    """Mean returns in one setting; the learned return is the mean of g / scale per episode.
+
+    An error stopped ``stopped`` of the ``episodes``. The means leave these out, unless they are all.
+    """
 
     setting: str
     episodes: Annotated[int, Meta(ge=1)]
+    stopped: Annotated[int, Meta(ge=0)]
     mean_return: Finite
     std_return: Finite | None = None
     mean_progress: Finite | None = None

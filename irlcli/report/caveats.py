@@ -69,6 +69,19 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
     return found
 
 
+def stopped(points: pd.DataFrame) -> list[str]:
+    """Evaluations in which an error stopped episodes."""
+    return [
+        f"Stopped by an error: {row}, {title(agent)} {measure} in {setting}: "
+        f"{group['stopped'].sum()} of {group['episodes'].sum()} episodes. The means leave them out, except "
+        "those of a policy whose episodes were all stopped."
+        for (row, agent, measure, setting), group in points.groupby(
+            ["row", "agent", "measure", "setting"], sort=False
+        )
+        if group["stopped"].any()
+    ]
+
+
 def weak_experts(
     p: Parameters, points: pd.DataFrame, cells: pd.DataFrame, assessments: Assessments
 ) -> list[str]:

@@ -17,6 +17,7 @@ Most functions take *points*: a row per evaluation and setting with the columns
                   standard errors of the differences to the expert, of the true and of the learned
                   returns, over episodes from the same start states; known of retrained policies
     episodes      their number
+    stopped       how many of them an error stopped; the means leave them out, unless they are all
     evaluation    id of the artefact
     demonstrations
                   ids of the datasets behind it; empty for experts and baselines

@@ -31,6 +31,7 @@ class AgentRow(NamedTuple):
         returns: mean true return of each policy. One policy under several rewards is no sample of
             true returns.
         episodes: per seed.
+        stopped: how many episodes an error stopped, of all policies. The means leave them out.
         progress: mean over policies; None if the environment reports none.
         learned: mean learned return over policies and rewards; None if no reward was given.
     """
@@ -40,6 +41,7 @@ class AgentRow(NamedTuple):
     setting: str
     returns: tuple[float, ...]
     episodes: int
+    stopped: int = 0
     progress: float | None = None
     learned: float | None = None
 
@@ -152,6 +154,7 @@ def _row(agent: str, env: str, setting: str, runs: Sequence[_Run]) -> AgentRow:
         setting,
         returns=tuple(math.fsum(each) / len(each) for each in policies.values()),
         episodes=min(item.episodes for item in measured),
+        stopped=sum(item.stopped for item in measured),
         progress=_mean([item.mean_progress for item in measured]),
         learned=_mean([item.mean_learned_return for item in measured]),
     )
@@ -170,6 +173,7 @@ def as_json(evaluations: Iterable[EvaluationRun]) -> list[dict[str, Any]]:
             "mean_progress": row.progress,
             "mean_learned_return": row.learned,
             "episodes_per_seed": row.episodes,
+            "stopped": row.stopped,
         }
         for row in rows(evaluations)
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import gymnasium
 import numpy as np
 import torch
@@ -38,6 +40,17 @@ class NormalisingExtractor(FlattenExtractor):
 def extractor(normalising: bool) -> type[FlattenExtractor]:
     """The features extractor of a policy that does, or does not, normalise observations."""
     return NormalisingExtractor if normalising else FlattenExtractor
+
+
+class _NoOptimiser(torch.optim.Optimizer):
+    """The optimiser of a policy that only acts.
+
+    SB3 gives each of its policies an optimiser, and the first optimiser of a process imports
+    PyTorch's compiler, which takes longer than a short evaluation.
+    """
+
+    def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: float):
+        pass
 
 
 class Policy:
@@ -169,6 +182,7 @@ def _plain(
             ortho_init=False,
             features_extractor_class=extractor(description.normalise_observations),
             use_sde=description.use_sde,
+            optimizer_class=_NoOptimiser,
         )
     )
 

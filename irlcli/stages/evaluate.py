@@ -48,7 +48,8 @@ def request(
     With ``reward``, a ``reward.pt``, also the return by that reward, each step under ``ceiling``: a
     quantile of g on the demonstrations, or None for the reward as learned. The labels tell whose
     policy and reward these are; they are not part of the identity. Outputs ``episodes.parquet`` (a
-    row per episode) and ``summary.json``.
+    row per episode) and ``summary.json`` (means over the episodes that
+    :func:`irlcli.trajectories.counted` selects).
 
     Raises:
         UsageError: a tabular environment.
@@ -111,6 +112,7 @@ def run(job: Job) -> None:
     from irlcli.data.outputs import write_json, write_rows
     from irlcli.data.tensors import load_policy_file, load_reward_file
     from irlcli.envs.spaces import check_spaces
+    from irlcli.trajectories import counted
 
     p: Parameters = job.parameters
     policy: Policy | str = p.agent
@@ -140,15 +142,19 @@ def run(job: Job) -> None:
                 "progress": t.progress,
                 "length": len(t),
                 "terminated": t.terminated,
+                "error": t.error or "",
             }
             for k, t in enumerate(trajectories)
         ]
-        means = summary_of(text, trajectories)
-        means["terminated"] = float(np.mean([t.terminated for t in trajectories]))
+        whole = counted(trajectories)
+        means = summary_of(text, whole)
+        means["episodes"] = len(trajectories)
+        means["stopped"] = sum(t.error is not None for t in trajectories)
+        means["terminated"] = float(np.mean([t.terminated for t in whole]))
         if "reward" in job.inputs:
             for row, trajectory in zip(here, trajectories, strict=True):
                 row["learned_return"] = frozen.of_episode(trajectory)
-            means["mean_learned_return"] = float(np.mean([row["learned_return"] for row in here]))
+            means["mean_learned_return"] = float(np.mean([frozen.of_episode(t) for t in whole]))
         rows += here
         summary.append(means)
         facts = {text: shown(means["mean_return"], means["mean_progress"])}
@@ -157,4 +163,4 @@ def run(job: Job) -> None:
     write_json(job.output / "summary.json", document | {"settings": summary})
 
 
-STAGE = Stage("evaluate", 3, run, reads=("evaluation",))
+STAGE = Stage("evaluate", 4, run, reads=("evaluation",))

@@ -112,6 +112,7 @@ def _points(job: Job) -> list[dict[str, Any]]:
                 "regret_error": errors.get((measured.setting, "true_return")),
                 "gap_error": errors.get((measured.setting, "learned_return")),
                 "episodes": measured.episodes,
+                "stopped": measured.stopped,
                 "evaluation": cell.run,
                 "demonstrations": " ".join(demonstrations(job.parameters, [cell])),
             }
@@ -139,7 +140,7 @@ def _errors(job: Job, cell: Cell) -> dict[tuple[str, str], float]:
     if role is None:
         return {}
     policy, expert = (
-        pd.read_parquet(job.inputs[r] / "episodes.parquet").set_index(
+        _counted(pd.read_parquet(job.inputs[r] / "episodes.parquet")).set_index(
             ["setting", "episode", "seed"]
         )
         for r in (cell.role, role)
@@ -150,6 +151,12 @@ def _errors(job: Job, cell: Cell) -> dict[tuple[str, str], float]:
     # An episode that only one of them has is undefined, and sem() omits it.
     differences = expert[kinds] - policy[kinds]
     return differences.groupby("setting").sem().stack().to_dict()
+
+
+def _counted(episodes: pd.DataFrame) -> pd.DataFrame:
+    """As :func:`irlcli.trajectories.counted`, in each setting."""
+    whole = episodes["error"] == ""
+    return episodes[whole | ~whole.groupby(episodes["setting"]).transform("any")]
 
 
 def _episodes(job: Job) -> caveats.Episodes:
@@ -228,4 +235,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 45, run)
+STAGE = Stage("report", 46, run)

@@ -126,16 +126,13 @@ def deciding_score(
     episodes: "Sequence[Trajectory]",
     score: "Callable[[Trajectory], float]",
 ) -> float:
-    """Mean ``score`` of a policy's ``episodes``, by which it is kept or not.
-
-    An episode that an error stopped lacks the rewards of its other steps; where these are negative it
-    would look like a success. It counts only if an error stopped all of them. They are named.
-    """
+    """Mean ``score`` of a policy's ``episodes``, by which it is kept or not. Errors are named."""
     import numpy as np
 
+    from irlcli.trajectories import counted
+
     job.warn_of_errors(setting, episodes)
-    whole = [episode for episode in episodes if episode.error is None]
-    return float(np.mean([score(episode) for episode in whole or episodes]))
+    return float(np.mean([score(episode) for episode in counted(episodes)]))
 
 
 def warn_of_labels(job: Job, counts: Sequence[int]) -> None:

@@ -228,7 +228,7 @@ def test_the_largest_mean_is_chosen(tmp_path, first, second, chosen, ties):
     for weight, means in ((0.1, first), (1.0, second)):
         for setting, mean in zip((FIRST, SECOND), means, strict=True):
             path = tmp_path / f"{weight} {setting}.json"
-            returns = {"setting": setting, "episodes": 1, "mean_return": mean}
+            returns = {"setting": setting, "episodes": 1, "stopped": 0, "mean_return": mean}
             policy = {"agent": "student", "env": LANDER}
             path.write_text(json.dumps({"policy": policy, "settings": [returns]}))
             inputs[f"lambda {weight} without {setting}"] = path

@@ -306,6 +306,39 @@ def test_an_episode_that_ends_on_an_error_is_named(bench, words):
     assert "warning: mass=2x, episode 0: it fell over" in done.err
 
 
+FELL = "info = {{'error': 'it fell over'}} if {} else {{}}\n        reward = -1.0"
+
+
+def test_means_leave_out_episodes_that_an_error_stopped(bench):
+    """On every later run, too: their table says how many there were."""
+    bench.edit(
+        bench.module, "reward = 1.0 - abs(self.position)", FELL.format("self.position > 0.0")
+    )
+    bench.edit(bench.module, "> 5.0, False, {}", "> 5.0, False, info")
+    words = ("evaluate", "--idle", "--env", "cart.toml", *ONE, "--episodes", "8")
+    made = json.loads(bench.irl(*words, "--json").out)
+    again = bench.irl(*words)
+    assert "fell over" not in again.err
+    directory = Path("runs", made["id"])
+    episodes = pq.read_table(directory / "episodes.parquet").to_pylist()
+    lengths = {row["error"]: row["length"] for row in episodes}
+    assert lengths["it fell over"] == 1 and lengths[""] > 1
+    stopped = sum(row["error"] != "" for row in episodes)
+    (measured,) = json.loads((directory / "summary.json").read_text())["settings"]
+    assert (measured["episodes"], measured["stopped"]) == (8, stopped)
+    assert measured["mean_return"] == -lengths[""] == -measured["mean_length"]
+    header, row = again.err.splitlines()[-2:]
+    assert "stopped by an error" in header and row.split()[-1] == str(stopped)
+
+
+def test_if_an_error_stopped_all_episodes_their_means_are_kept(bench):
+    bench.edit(bench.module, "reward = 1.0 - abs(self.position)", FELL.format("True"))
+    bench.edit(bench.module, "> 5.0, False, {}", "> 5.0, False, info")
+    words = ("evaluate", "--idle", "--env", "cart.toml", *ONE, "--episodes", "2", "--json")
+    (row,) = json.loads(bench.irl(*words).out)["returns"]
+    assert (row["mean"], row["episodes_per_seed"], row["stopped"]) == (-1.0, 2, 2)
+
+
 def test_an_error_ends_an_episode_and_progress_may_begin_later(bench):
     bench.edit(bench.module, "self.speed = 0.0", "self.speed = 0.0\n        self.steps = 0")
     bench.edit(

@@ -67,6 +67,7 @@ def example(values, **more):
                         "regret_error": None,
                         "gap_error": None,
                         "episodes": 20,
+                        "stopped": 0,
                         "evaluation": id16,
                         "demonstrations": "",
                     }

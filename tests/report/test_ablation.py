@@ -39,7 +39,7 @@ def ablation(returns, experts=EXPERTS, method="erm", shared=()):
         if run:
             point = {"row": BOUNCE, "agent": agent, "measure": measure, "seed": seed}
             point |= {"retraining": retraining, "setting": setting, "true_return": value}
-            point |= {"progress": progress, "learned_return": None, "episodes": 20}
+            point |= {"progress": progress, "learned_return": None, "episodes": 20, "stopped": 0}
             points.append(point | {"evaluation": run})
 
     for setting, (value, progress) in experts.items():

@@ -23,6 +23,16 @@ def test_a_complete_table_has_no_caveats():
     assert build(*example(complete()), {}, {}).caveats == []
 
 
+def test_episodes_that_an_error_stopped():
+    p, points = example(complete())
+    student = (points["row"] == BOUNCE) & (points["agent"] == "erm") & (points["seed"] == 1)
+    points.loc[student & (points["measure"] == "zero-shot"), "stopped"] = 3
+    (caveat,) = build(p, points, {}, {}).caveats
+    assert caveat.startswith(
+        f"Stopped by an error: {BOUNCE}, AIRL-ERM zero-shot in bounce=0.9: 3 of 60"
+    )
+
+
 def test_a_student_that_did_not_imitate():
     found = build(*example(complete(student=199.0)), {}, {}).caveats
     (marked,) = (c for c in found if c.startswith(f"Not imitated: {BOUNCE}, AIRL-ERM"))

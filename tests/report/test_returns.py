@@ -8,9 +8,13 @@ from irlcli.errors import UsageError
 from irlcli.report.returns import rows
 
 
-def evaluation(agent, mean, seed=None, made=None, episodes=20, progress=None, **subject):
+def evaluation(agent, mean, seed=None, made=None, episodes=20, progress=None, stopped=0, **subject):
     place = Returns(
-        setting="bounce=0.9", episodes=episodes, mean_return=mean, mean_progress=progress
+        setting="bounce=0.9",
+        episodes=episodes,
+        stopped=stopped,
+        mean_return=mean,
+        mean_progress=progress,
     )
     summary = Evaluation(
         policy=Subject(agent=agent, env="lunar-lander", seed=seed, **subject), settings=(place,)
@@ -33,6 +37,11 @@ def test_statistics_are_over_seeds():
     assert found[1].mean == 4.0
     assert found[1].deviation == pytest.approx(13.0**0.5)
     assert found[0].deviation is None
+
+
+def test_episodes_that_an_error_stopped_are_added_up():
+    (row,) = rows([evaluation("expert", 0.0, k, stopped=n) for k, n in enumerate((2, 0, 5))])
+    assert row.stopped == 7
 
 
 def test_a_row_has_the_fewest_episodes_of_its_seeds():

@@ -169,7 +169,7 @@ def describing(place: Path) -> Target:
     policy = {"agent": "student", "env": "lunar-lander", "settings": ["bounce=0.5"], "seed": 0}
     network = {"algorithm": "ppo", "env": "lunar-lander", "net_arch": [64], "activation": "tanh"}
     subject = {"agent": "expert", "env": "ant"}
-    row = {"setting": "mass=2x", "episodes": 3, "mean_return": 1.5}
+    row = {"setting": "mass=2x", "episodes": 3, "mean_return": 1.5, "stopped": 0}
     seeds = [
         {**policy, "network": {**network, "ortho_init": True}, "method": "irm"},
         {"policy": subject, "settings": [row]},
