@@ -405,9 +405,13 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The config of a policy retrained in ``setting``, with a knob's own, see :meth:`_of`."""
         return self._of("transfer", setting)
 
+    def knobs_with(self, section: str, settings: Sequence[Setting]) -> list[str]:
+        """The knobs in ``settings`` that have a ``section`` of their own."""
+        knobs = {knob for setting in settings for knob in setting.knobs} & set(self.interventions)
+        return sorted(k for k in knobs if getattr(self.interventions[k], section) is not None)
+
     def _of(self, section: str, *settings: Setting) -> Any:
         """The ``section`` of the one knob in ``settings`` that has its own; none counts beside another."""
-        knobs = {knob for setting in settings for knob in setting.knobs} & set(self.interventions)
-        own = [getattr(self.interventions[knob], section) for knob in knobs]
-        given = [config for config in own if config is not None]
-        return given[0] if len(given) == 1 else getattr(self, section)
+        knobs = self.knobs_with(section, settings)
+        where = self.interventions[knobs[0]] if len(knobs) == 1 else self
+        return getattr(where, section)

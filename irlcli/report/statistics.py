@@ -173,10 +173,11 @@ def _variances(true: float, freedom: int) -> tuple[np.ndarray, np.ndarray]:
 def paired_p(x: Sequence[float], y: Sequence[float]) -> float | None:
     """Two-sided p of the paired t-test on ``x`` [n] and ``y`` [n], aligned by seed.
 
-    None below two pairs, or if all differences are equal.
+    None below two pairs, or if all differences are equal up to rounding.
     """
     differences = np.asarray(x, np.float64) - np.asarray(y, np.float64)
-    if len(differences) < 2 or not np.ptp(differences):
+    rounding = 1e-12 * np.abs([x, y]).max(initial=0.0)
+    if len(differences) < 2 or np.ptp(differences) <= rounding:
         return None
     return float(stats.ttest_rel(x, y).pvalue)
 

@@ -400,6 +400,18 @@ def warn_of_weight(console: "RunConsole", name: str, config: "AIRLConfig | MaxEn
         console.warn(f"lambda is 0: {name} learns without its penalty, {config.penalty}")
 
 
+def warn_of_several(
+    console: "RunConsole", config: "Config", section: str, settings: Sequence[Setting]
+) -> None:
+    """Warn if several knobs in ``settings`` have a ``section`` of their own: none of them applies."""
+    knobs = config.knobs_with(section, settings)
+    if len(knobs) > 1:
+        console.warn(
+            f"{' and '.join(knobs)} each have their own [{section}], and these cannot be combined: the "
+            f"environment's [{section}] is used (--settings FILE or --set changes it)"
+        )
+
+
 def warn_of_scale(console: "RunConsole", penalty: str, weight: float, setter: str) -> None:
     """Warn if AIRL's lambda, meant for another penalty, does not suit ``penalty``.
 

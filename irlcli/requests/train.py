@@ -71,6 +71,7 @@ def train_airl(
     }
     config = session.config(env, flags)
     airl = config.airl_of(settings)
+    arguments.warn_of_several(session.console, config, "airl", settings)
     arguments.check_weighted(airl_stage.method_of(airl), METHODS, airl.penalty, penalty_weight)
     arguments.warn_of_weight(session.console, airl_stage.method_of(airl), airl)
     if (penalty_weight, choose_penalty) == (None, None) and not arguments.weights_set(

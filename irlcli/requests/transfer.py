@@ -61,6 +61,7 @@ def transfer(
             f"{reward!r} was learned in settings that do not change {' or '.join(new)}: it may not "
             "hold there"
         )
+    arguments.warn_of_several(session.console, config, "transfer", settings)
     label = reward_label(origin.airl, origin.seed)
     return stage.request(
         source,

@@ -554,6 +554,19 @@ def test_a_lambda_meant_for_another_penalty_is_named(irl, smoke_store, words, wa
     assert ("by --penalty-weight," in done.err) == warned
 
 
+@pytest.mark.parametrize(("knobs", "warned"), [("bounce engine-power", True), ("bounce", False)])
+def test_sections_of_two_knobs_that_cannot_be_combined_are_named(
+    irl, smoke_store, tmp_path, knobs, warned
+):
+    own = "[interventions.{}.transfer]\nceiling = 0.9\n"
+    (tmp_path / "my.toml").write_text("".join(own.format(knob) for knob in knobs.split()))
+    words = ["--settings", tmp_path / "my.toml", "--setting", "engine-power=1.5x,bounce=0.9"]
+    line = ["transfer", "--reward", "airl", *words, "--dry-run", *SMOKE]
+    done = irl(*line, "--store", smoke_store.path)
+    assert done.code == 0, done.err
+    assert ("bounce and engine-power each have their own [transfer]" in done.err) == warned
+
+
 @pytest.mark.parametrize(("words", "warned"), [([], True), (["--choose-penalty", "own"], False)])
 def test_a_table_names_a_lambda_meant_for_another_penalty(irl, tmp_path, words, warned):
     line = [

@@ -85,6 +85,8 @@ def test_pairs_take_out_what_seeds_share():
     x, y = [1.1, 101.2, 201.0, 301.1], [0.0, 100.0, 200.0, 300.0]
     assert paired_p(x, y) < 0.001 < 0.9 < compare(x, y).welch
     assert paired_p([1.0], [0.0]) is None
+    # 0.1 each time, but for rounding.
+    assert paired_p([10.1, 20.2, 30.3], [10.0, 20.1, 30.2]) is None
 
 
 @pytest.mark.parametrize(("n", "effect"), [(26, 0.8), (64, 0.5), (394, 0.2)])
