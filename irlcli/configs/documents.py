@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 
-from irlcli.errors import UsageError, suggest
+from irlcli.errors import NotFound, UsageError, suggest
 
 # A deep dotted key takes tomllib the square of its length: 12 s for 32 KB.
 _MAX_TOML_BYTES = 64 << 10
@@ -31,6 +31,7 @@ def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
     """The TOML document in ``path``, which ``option`` named.
 
     Raises:
+        NotFound: no such file.
         UsageError: not a plain file, too large, malformed or unreadable.
     """
     try:
@@ -51,6 +52,8 @@ def read_toml(path: Path, option: str = "--settings") -> dict[str, Any]:
         raise UsageError(
             f"{path} is not valid TOML: {error}", f"{quotes}see settings/ for examples"
         ) from None
+    except FileNotFoundError:
+        raise NotFound(f"there is no file {path}", f"name a TOML file with {option}") from None
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read: {error.strerror}", f"name a TOML file with {option}"

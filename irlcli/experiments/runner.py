@@ -55,13 +55,15 @@ class Silent(RunConsole):
 
 
 @contextmanager
-def _file_errors_of(label: str) -> Iterator[None]:
+def _file_errors_of(label: str, store: Store) -> Iterator[None]:
     """Report a full disk or a file that cannot be written as a failure of the stage ``label``."""
     try:
         yield
     except OSError as error:
+        # A full disk names no file.
+        where = "" if error.filename else f" (store {store.root})"
         raise StageFailed(
-            f"{label}: {file_failure(error).message}",
+            f"{label}: {file_failure(error).message}{where}",
             "No partial output was written. Fix the problem and run the same command again: it "
             "resumes from the last checkpoint, if there is one.",
         ) from error
@@ -116,7 +118,7 @@ class Runner:
             Busy: another process computes it, or gc runs, and this runner does not wait.
             Interrupted: a signal requested a stop; the checkpoint has been saved.
         """
-        with _file_errors_of(request.label):
+        with _file_errors_of(request.label, self.store):
             self.store.create()
             # From the first artefact that is looked up to the last one that is made from it.
             with self.store.in_use(self.wait, partial(self.console.wait, "the store")):
@@ -139,7 +141,7 @@ class Runner:
             return None
         with (
             suppress(Busy),
-            _file_errors_of(request.label),
+            _file_errors_of(request.label, self.store),
             self.store.working_on(record.key, wait=False),
         ):
             artefact = self.store.find(record.key)
@@ -160,7 +162,7 @@ class Runner:
         if record.key not in done:
             artefact = self.store.find(record.key)
             if artefact is None:
-                with _file_errors_of(request.label):
+                with _file_errors_of(request.label, self.store):
                     artefact = self._obtain(request, record, sources)
             else:
                 self.console.finish(request.label, artefact, hit=True)

@@ -161,7 +161,9 @@ def short_of_expert(learned_returns: pd.DataFrame) -> list[str]:
                 f"Optimisation fell short: the reward scores the expert above {lower} of them."
             ] * (lower > 0)
             if r.short_uncertain:
-                parts.append(f"Uncertain (within two standard errors): {r.short_uncertain}.")
+                parts.append(
+                    f"Uncertain (within two standard errors): {r.short_uncertain} of the {r.short}."
+                )
             found.append(
                 f"Short of the expert: {r.row}, {title(r.agent)}: {r.short} of {r.judged} retrained "
                 f"policies. {' '.join(parts)}"

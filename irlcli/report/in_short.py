@@ -48,7 +48,7 @@ def _verdict(test: Any) -> str:
         failed = " and ".join(map(title, test.not_imitated.split()))
         return f"{failed} did not imitate in distribution: do not interpret the gap."
     if pd.isna(test.p_welch):
-        return f"Do not compare {x} with {y}, there is no test: {test.why}."
+        return f"Do not compare {x} with {y}: {test.why}."
     claim = f"{x} and {y} do not differ significantly"
     if test.p_welch_holm < LEVEL:
         more = "more" if test.difference > 0 else "less"

@@ -239,7 +239,7 @@ def learned_returns(found: pd.DataFrame) -> Table:
             number(r.expert),
             f"{r.short}/{r.judged}" if r.judged else "-",
             f"{r.short_scored_higher}/{r.short}" if r.short else "",
-            str(r.uncertain) if r.judged else "",
+            f"{r.uncertain}/{r.judged}" if r.judged else "",
         ]
         for r in found.itertuples()
     ]
@@ -266,7 +266,7 @@ def reward_quality(found: pd.DataFrame) -> Table:
                     f"{verdicts.count(v)}/{len(verdicts)}" if verdicts else ""
                     for v in get_args(Verdict)
                 ),
-                str(seeds["uncertain"].sum()) if verdicts else "",
+                f"{seeds['uncertain'].sum()}/{len(verdicts)}" if verdicts else "",
             ]
         )
     columns = ["row", "setting", "method", "seeds", "Spearman", "lower half", "expert - idle"]

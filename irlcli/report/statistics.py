@@ -124,7 +124,7 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
         return Comparison(why="one of the two has no seed")
     found = Comparison(float(a.mean() - b.mean()))
     if min(len(a), len(b)) == 1:
-        return replace(found, why="one seed has no variance; each of the two needs two")
+        return replace(found, why="one seed has no variance, and a test needs two seeds of each")
     rank, improvement = rank_test(a, b)
     found = replace(found, rank=rank, improvement=improvement)
     if not np.ptp(a) and not np.ptp(b):

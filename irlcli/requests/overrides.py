@@ -41,7 +41,10 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
         held = {_held(field, each) for each in parameters} - {None}
         if held and _shown(field, value) not in held:
             values = " or ".join(sorted(text for text in held if text))
-            yield f"--set {item} has no effect: the environment or other options make it {values}"
+            yield (
+                f"--set {item} counts as {values} here: the environment or other options make it so, or "
+                "the two mean the same"
+            )
 
 
 def unread(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[str]:

@@ -73,7 +73,10 @@ def _candidates(
 ) -> tuple[float, ...]:
     """The weights to compare, in order, after a check that settings can be left out."""
     if airl.penalty == "none":
-        raise UsageError("this method has no penalty to weigh", "--method irm has one")
+        raise UsageError(
+            "--choose-penalty compares weights of a penalty, and this method has none",
+            "--method irm has one",
+        )
     penalty = PENALTIES[airl.penalty]
     candidates = tuple(sorted(set(penalty.candidates if weights == "own" else weights)))
     if len(settings) < 2:

@@ -147,7 +147,7 @@ def test_verdicts_are_on_policies_that_began_at_random_whatever_their_names():
     close = assess("lunar-lander", reward, members, {})
     report = build(p, points, {}, {}, {(BOUNCE, "irm", 0): close})
     assert report.reward_quality["uncertain"].tolist() == [1]
-    assert column(table(report, "Reward quality"), "uncertain") == ["1"]
+    assert column(table(report, "Reward quality"), "uncertain") == ["1/1"]
     # Beside an expert that earns no more than the random agent, a verdict says nothing.
     members[1] = member("random", "random", 100.0)
     weak = assess("lunar-lander", reward, members, {})
