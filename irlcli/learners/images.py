@@ -37,7 +37,7 @@ class Images:
         if self._group is None:
             return batch
         elements = self._drawn(batch.terminated.shape, generator)
-        # What follows the action tells absorbing states apart.
+        # The input after the action marks absorbing states.
         action, other = batch.actions.tensor_split([self._actions.shape[-1]], -1)
         return replace(
             batch,

@@ -127,7 +127,7 @@ def _earned_in(setting: str, points: pd.DataFrame, methods: Sequence[str]) -> pd
         for (agent, measure), group in learned.groupby(["agent", "measure"], sort=False)
     }
     if len(reused):
-        earned["episodes of the best training expert"] = reused["true_return"].max()
+        earned["the best training expert there"] = reused["true_return"].max()
     return pd.Series(earned, dtype=float)
 
 
@@ -140,10 +140,10 @@ def below_bar(p: Parameters, points: pd.DataFrame) -> list[str]:
         low = experts[experts["true_return"] < (-math.inf if bar is None else bar)]
         if len(low):
             earned = zip(low["setting"], low["true_return"], strict=True)
-            listed = ", ".join(f"{setting} ({earns:.0f})" for setting, earns in earned)
+            listed = ", ".join(f"{setting} ({earns:.1f})" for setting, earns in earned)
             found.append(
-                f"Expert below its bar of {bar:.0f}: {row.name}: {listed}. Shares of it overstate how well "
-                "a policy does."
+                f"Expert below its bar of {bar:g}: {row.name}: {listed}. Compared with it, policies look "
+                "better than they are."
             )
     return found
 

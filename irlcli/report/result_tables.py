@@ -53,13 +53,13 @@ _ZERO_SHOT_NOTE = (
 _LEARNED_NOTE = (
     "Learned return: the sum of the frozen reward over an episode, undiscounted (training "
     "discounts), mean over seeds; of the policy retrained on that reward, and of the held-out "
-    "setting's expert. Short: policies with a regret of more than 10 % of what the "
-    "expert earns above the random agent; - if the expert is no better than the random agent. Scored higher: those of them that the reward scores at least "
-    "as high as the expert, so that it is wrong. In the others, optimisation fell short, which does not "
-    "show that the reward is right. Uncertain: verdicts on differences within two standard errors of the "
-    "episodes. Both are scored under the transfer.ceiling that the policy was "
-    "trained under, if any. The unit is the standard deviation of g on the training data; zero has no "
-    "meaning."
+    "setting's expert. Both are under the policy's transfer.ceiling, if it has one. Short: policies "
+    "with a regret of more than 10 % of what the expert earns above the random agent; - if the expert "
+    "is no better than the random agent. Scored higher: those of the short ones that the reward "
+    "scores at least as high as the expert, so that it is wrong. In the others, optimisation fell "
+    "short, which does not show that the reward is right. Uncertain: of all verdicts, also that a "
+    "policy is not short, those on differences within two standard errors of the episodes. The unit "
+    "is the standard deviation of g on the training data; zero has no meaning."
 )
 _QUALITY_NOTE = (
     "How well the frozen reward ranks a bank of policies (idle, random, a clone of the demonstrations "
@@ -88,19 +88,19 @@ _DISCRIMINATOR_NOTE = (
     "Over the last tenth of the rounds, means over settings and seeds. This round: after the update, on "
     "a new minibatch of the round's episodes and the demonstrations, which the update used; the penalty "
     "is IRMv1, also for methods that do not penalise it. Optimised: means over the update's minibatches, "
-    "which hold replayed episodes; challengers and the gradient penalty are not included. With symmetries they are random "
-    "images; the samples of *this round* are as recorded. Share: lambda times "
-    "the optimised penalty over the optimised cross-entropy times its weight in the loss, which challengers reduce by "
-    "airl.challenger.share. The unbiased estimate of the penalty "
+    "which hold replayed episodes; challengers and the gradient penalty are not included. With "
+    "airl.symmetries the optimised samples are random images; those of *this round* are as recorded. "
+    "Share: lambda times the optimised penalty over the optimised cross-entropy times its weight in "
+    "the loss, which challengers reduce by airl.challenger.share. The unbiased estimate of the penalty "
     "may be negative. Where --select kept an earlier round, or rounds were averaged, these are still the "
     "last rounds. If the discriminator is always right, the penalty has nothing to change."
 )
 _CELL_NOTE = (
     "95 %: percentile bootstrap interval of the mean over seeds, too narrow with few seeds. IQM: "
     "mean of the middle half of the seeds. Retrainings: standard deviation between policies "
-    "trained on one reward, pooled over rewards; the sd over seeds is of their means. Random and idle are one policy "
-    "each, and so is the held-out setting's expert; in distribution there is one expert per training setting, "
-    "and the reused experts are these, each in the other settings."
+    "trained on one reward, pooled over rewards; the sd over seeds is that of each reward's mean. Random "
+    "and idle are one policy each, and so is the held-out setting's expert; in distribution there is "
+    "one expert per training setting, and the reused experts are these, each in the other settings."
 )
 _BUDGET_NOTE = (
     "Steps: the budget in whole rounds; the steps of challengers are not counted. "

@@ -241,7 +241,7 @@ def steps_of(plan: "Plan", warn: Callable[[str], None]) -> list[dict[str, Any]]:
     """A document for each step of ``plan``.
 
     ``other_versions`` says how the libraries that made an existing artefact differ from those
-    present. ``warn`` is told of artefacts whose provenance is damaged.
+    present. ``warn`` receives a line for each artefact whose provenance is damaged.
     """
     documents = []
     for name in plan.tasks:

@@ -151,7 +151,7 @@ def warn_of_failures(
 ) -> None:
     """Warn of demonstrations that end early and earn less than those of the setting that do not.
 
-    What follows such an end is then the expert's, too, and a reward may score it highly.
+    The absorbing states after such an end count as the expert's, so a reward may score them highly.
     ``deterministic``: whether they are the expert's most likely actions, or samples; None: unknown.
     """
     import numpy as np

@@ -56,7 +56,7 @@ def test_an_expert_no_better_than_an_agent_that_learns_nothing(agent, expert, we
 @pytest.mark.parametrize(
     ("agent", "measure", "earned", "better"),
     [
-        ("reused", "ood", [90.0, 251.0], "episodes of the best training expert (251.0)"),
+        ("reused", "ood", [90.0, 251.0], "the best training expert there (251.0)"),
         ("irm", "transfer", [249.0, 252.0, 252.0], "AIRL-IRM's transfer policies (251.0)"),
         ("irm", "transfer", [200.0, 210.0, 339.0], None),
         ("reused", "id", [400.0, 400.0], None),
