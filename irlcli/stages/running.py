@@ -46,9 +46,8 @@ def run_training(job: Job, training: "Training | Restarts") -> "list[Row]":
         first = newest[0]["round"] == 0 and not newest[0].get("restart")
         if first and all(isnan(row["true_return"]) for row in newest):
             job.console.warn(
-                "no episode ended in the first round. Every round starts new episodes, so nothing is learned "
-                "about the steps of an episode after the end of its round: raise n_steps "
-                "(for PPO rollouts_per_round does it, too)"
+                "no episode ended in the first round, and every round starts new ones, so the later steps "
+                "of an episode are never trained on: raise n_steps or, for PPO, rollouts_per_round"
             )
         job.checkpoints.offer(encoded)
 
