@@ -74,7 +74,7 @@ def _candidates(
     """The weights to compare, in order, after a check that settings can be left out."""
     if airl.penalty == "none":
         raise UsageError(
-            "--choose-penalty compares weights of a penalty, and this method has none",
+            "--choose-penalty chooses the weight of a penalty, and this method has no penalty",
             "--method irm has one",
         )
     penalty = PENALTIES[airl.penalty]

@@ -147,7 +147,7 @@ WRONG = [
     ("train-airl --demos demos --set airl.ppo.n_envs=0", 2, "airl.ppo.n_envs"),
     ("train-airl --demos demos --set airl.actions=executed", 2, "needs continuous actions"),
     ("train-airl --demos demos --set airl.actions=clipped", 2, "airl.actions"),
-    ("train-airl --demos demos --settings absent.toml", 2, "absent.toml"),
+    ("train-airl --demos demos --settings absent.toml", 3, "absent.toml"),
     ("train-airl --demos demos --settings {tmp}", 2, "{tmp}"),
     ("train-airl --demos demos --settings {tmp}/broken.toml", 2, "broken.toml"),
     ("train-airl --demos demos --settings {tmp}/unknown.toml", 2, "unknown.toml"),

@@ -23,7 +23,7 @@ from irlcli.configs.schema import (
     TransferConfig,
 )
 from irlcli.envs.registry import ENVIRONMENTS
-from irlcli.errors import UsageError
+from irlcli.errors import NotFound, UsageError
 from irlcli.interventions import Setting, parse_setting, parse_settings
 from irlcli.store import canonical_json
 
@@ -311,10 +311,11 @@ def test_malformed_toml_names_the_file(toml, text):
     assert str(path) in error.message and "TOML" in error.message
 
 
-def test_files_that_cannot_be_read(tmp_path):
-    for path in (tmp_path / "absent.toml", tmp_path):
-        error = refused(files=[path])
-        assert str(path) in error.message and "--settings" in error.hint
+@pytest.mark.parametrize(("name", "error"), [("absent.toml", NotFound), (".", UsageError)])
+def test_files_that_cannot_be_read(tmp_path, name, error):
+    with pytest.raises(error) as caught:
+        load_config("lunar-lander", files=[tmp_path / name])
+    assert str(tmp_path / name) in caught.value.message and "--settings" in caught.value.hint
 
 
 @pytest.mark.parametrize(

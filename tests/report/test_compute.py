@@ -218,7 +218,7 @@ def test_only_policies_that_fall_short_count_as_uncertain_in_the_caveat():
     (found,) = report.learned_returns.itertuples()
     assert (found.short, found.uncertain, found.short_uncertain) == (2, 2, 1)
     (caveat,) = (c for c in report.caveats if c.startswith("Short of"))
-    assert "2 of 3" in caveat and caveat.endswith("standard errors): 1.")
+    assert "2 of 3" in caveat and caveat.endswith("standard errors): 1 of the 2.")
 
 
 def test_every_retrained_policy_of_a_reward_is_judged():

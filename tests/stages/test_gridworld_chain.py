@@ -272,7 +272,7 @@ def test_figure_and_table(run, store):
     plan = run("report", "figure2", "--dry-run").out.splitlines()
     assert len(plan) == 4 and all(line.startswith("HIT") for line in plan)
     warned = run("report", "figure2", "--set", "maxent.penalty_weight=3", "--dry-run").err
-    assert warned.count("--set maxent.penalty_weight=3 has no effect") == 1
+    assert warned.count("--set maxent.penalty_weight=3 counts as 0.0") == 1
     lineage = run_light("lineage", "fig", "--store", store)
     assert "sweep-maxent" in lineage and lineage.count("collect-experts") == 3
 
