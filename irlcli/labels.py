@@ -208,7 +208,7 @@ def _made(record: KeyRecord) -> list[Any]:
 def _number(value: Any) -> str:
     if isinstance(value, int) and not _is_count(value):
         return "?"
-    return f"{value:g}" if isinstance(value, int | float) else str(value)
+    return f"{value:.12g}" if isinstance(value, int | float) else str(value)
 
 
 def _is_count(value: Any) -> bool:

@@ -3,11 +3,14 @@
 import itertools
 
 import msgspec
+import pytest
 
 from irlcli import labels
 from irlcli.configs import AIRLConfig, MaxEntConfig, TransferConfig
+from irlcli.controls.methods import LabelMethod, MapMethod
 from irlcli.data.descriptions import Subject
 from irlcli.report.returns import agent_name
+from irlcli.stages.sweep_maxent import SweepVariant
 from irlcli.store import KeyRecord
 
 WAYS = [
@@ -67,6 +70,20 @@ def test_the_label_of_an_evaluation_tells_under_which_ceiling_it_scored():
         KeyRecord("evaluate", 1, parameters | more, inputs) for more in ({}, {"ceiling": 0.9})
     )
     assert labels.origin(plain, {}) != labels.origin(bounded, {})
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.1, 1e-5, 1e6])
+def test_names_tell_close_weights_apart(weight):
+    close = weight * (1 + 1e-9)
+    for variant in (SweepVariant, MapMethod):
+        names = [
+            str(variant(grouping="per-setting", penalty="irmv1", penalty_weight=w))
+            for w in (weight, close)
+        ]
+        assert all_differ(names)
+    assert all_differ([str(LabelMethod(penalty="irmv1", weight=w)) for w in (weight, close)])
+    airl = msgspec.to_builtins(AIRLConfig(grouping="per-setting", penalty="irmv1"))
+    assert all_differ([labels.learned(airl | {"penalty_weight": w}) for w in (weight, close)])
 
 
 def test_plans_and_listings_describe_rewards_alike():

@@ -44,9 +44,9 @@ class SweepVariant(msgspec.Struct, frozen=True, kw_only=True):
         """For example ``erm l2 0.1`` or ``irm-shuffled irmv1 0.05``."""
         parts = [_NAMES.get(self.grouping, f"irm-{self.grouping}")]
         if self.penalty != "none":
-            parts.append(f"{self.penalty} {self.penalty_weight:g}")
+            parts.append(f"{self.penalty} {self.penalty_weight:.12g}")
         if self.l2:
-            parts.append(f"l2 {self.l2:g}")
+            parts.append(f"l2 {self.l2:.12g}")
         return " ".join(parts)
 
 
