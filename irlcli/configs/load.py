@@ -66,6 +66,7 @@ def load_config(
         flags: dotted field to value; None is left out.
 
     Raises:
+        NotFound: one of ``files`` does not exist.
         UsageError: unknown environment, profile, field or value; malformed or unreadable TOML; a
             field that ``overrides`` and ``flags`` set to different values.
     """

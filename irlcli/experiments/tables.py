@@ -122,11 +122,11 @@ def load_tables(path: Path | None = None) -> dict[str, Table]:
     Raises:
         UsageError: not TOML; an unknown field, kind, environment, knob, method or measure; a
             missing field. The message names the file and the field.
-        NotFound: a row's file does not exist.
+        NotFound: this file or a row's does not exist.
     """
     path = path or default_file()
     try:
-        tree = read_toml(path)
+        tree = read_toml(path, "--experiments")
     except UsageError as error:
         raise UsageError(error.message, f"see {default_file()} for an example") from None
     try:
