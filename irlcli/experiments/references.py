@@ -15,6 +15,7 @@ from irlcli.errors import NotFound, UsageError
 from irlcli.experiments.inputs import foreign_source, source_in
 from irlcli.experiments.introduce import introduce
 from irlcli.interventions import Setting, check_observed, cue_in, parse_setting, without_cue
+from irlcli.stages import evaluate
 from irlcli.stages.base import Source
 from irlcli.store import Artefact, Store, read_json
 
@@ -221,10 +222,17 @@ def summary(store: Store, artefact: Artefact) -> descriptions.Evaluation:
     """The summary of an evaluation.
 
     Raises:
-        UsageError: an artefact without a summary.
+        UsageError: an artefact without a summary, or of another version of the stage.
         IntegrityError: damaged.
     """
     introduce(artefact)
+    version = artefact.manifest.record.stage_version
+    if version != evaluate.STAGE.version:
+        raise UsageError(
+            f"evaluation {artefact.id} is of version {version} of its stage, and this irlcli reads version "
+            f"{evaluate.STAGE.version}",
+            f"run its command again: `irl show {artefact.id}` prints it",
+        )
     path = store.open(artefact, _required(artefact, "summary.json"))
     return descriptions.parse(read_json(path), descriptions.Evaluation, path)
 

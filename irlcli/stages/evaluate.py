@@ -152,9 +152,10 @@ def run(job: Job) -> None:
         means["stopped"] = sum(t.error is not None for t in trajectories)
         means["terminated"] = float(np.mean([t.terminated for t in whole]))
         if "reward" in job.inputs:
+            learned_returns = {t: frozen.of_episode(t) for t in trajectories}
             for row, trajectory in zip(here, trajectories, strict=True):
-                row["learned_return"] = frozen.of_episode(trajectory)
-            means["mean_learned_return"] = float(np.mean([frozen.of_episode(t) for t in whole]))
+                row["learned_return"] = learned_returns[trajectory]
+            means["mean_learned_return"] = float(np.mean([learned_returns[t] for t in whole]))
         rows += here
         summary.append(means)
         facts = {text: shown(means["mean_return"], means["mean_progress"])}

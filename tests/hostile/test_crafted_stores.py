@@ -325,6 +325,13 @@ def test_artefacts_of_another_form_have_no_part_in_a_report(empty_store, publish
     assert left_out(empty_store.artefacts(), wanted, set()) == []
 
 
+def test_an_evaluation_of_an_older_version_is_not_called_damaged(irl, empty_store, publish):
+    made = publish(empty_store, {"summary.json": b"{}"}, stage="evaluate").artefact
+    done = irl("report", "returns", made.id, "--store", empty_store.root)
+    assert done.code == 2 and "is of version 1 of its stage" in done.err
+    assert f"irl show {made.id}" in done.err
+
+
 def test_an_evaluation_that_was_made_from_itself_has_its_own_circumstances(empty_store, publish):
     files = {"summary.json": b"{}", "policy.pt": b"policy"}
     inputs = {"policy": hashlib.sha256(b"policy").hexdigest()}
