@@ -205,10 +205,15 @@ def _made(record: KeyRecord) -> list[Any]:
     return [*parts, retrained_as(record), seed]
 
 
+def weight_text(value: float) -> str:
+    """A weight to twelve digits, so that names tell close ones apart."""
+    return f"{value:.12g}"
+
+
 def _number(value: Any) -> str:
     if isinstance(value, int) and not _is_count(value):
         return "?"
-    return f"{value:.12g}" if isinstance(value, int | float) else str(value)
+    return weight_text(value) if isinstance(value, int | float) else str(value)
 
 
 def _is_count(value: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -79,6 +79,21 @@ def counted(episodes: Sequence[Trajectory]) -> Sequence[Trajectory]:
     would look like a success, so it counts only if an error stopped all of them.
     """
     return [episode for episode in episodes if episode.error is None] or episodes
+
+
+def unstopped(groups: Iterable[Sequence[Trajectory]], limit: int) -> list[int]:
+    """The numbers k whose episode no error stopped in any of ``groups``, policies that are paired by k.
+
+    All numbers of a policy whose episodes were all stopped are kept, as in :func:`counted`. Episodes
+    read from a file hold no error; only an error truncates one before the time ``limit`` [steps].
+    """
+    stopped: set[int] = set()
+    every: set[int] = set()
+    for group in groups:
+        here = {k for k, t in enumerate(group) if t.truncated and len(t) < limit}
+        stopped |= here if len(here) < len(group) else set()
+        every |= set(range(len(group)))
+    return sorted(every - stopped) or sorted(every)
 
 
 @dataclass(frozen=True, eq=False)

@@ -191,6 +191,7 @@ def publish_files(
     files: Mapping[str, bytes] = SMALL_FILES,
     *,
     stage: str = "train-airl",
+    version: int = 1,
     parameters: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
     places: Mapping[str, str] | None = None,
@@ -201,7 +202,7 @@ def publish_files(
     ``inputs`` are contents by role, ``places`` says where they were read, ``environment`` describes
     one from outside the package.
     """
-    record = KeyRecord(stage, 1, dict(parameters or {"seed": 0}), dict(inputs or {}))
+    record = KeyRecord(stage, version, dict(parameters or {"seed": 0}), dict(inputs or {}))
     store.create()
     with store.in_use(), store.working_on(record.key, wait=False) as scratch:
         output = scratch.new_output()

@@ -85,6 +85,11 @@ def print_assessment(assessment: Assessment) -> None:
         + ("; learned returns above are without the ceiling" if _bounded(assessment) else "")
         + ("; in all settings a policy counts once for each" if assessment.pooled else "")
     )
+    if assessment.left_out:
+        out.print_note(
+            f"{assessment.left_out} episodes of each policy are left out: an error stopped them for one of "
+            "the policies"
+        )
     ranked = ["policies", "Spearman", "Pearson"]
     columns = ["setting", *ranked, *(f"{name}, lower half" for name in ranked)]
     columns += ["expert - idle", "return distance", "EPIC"]

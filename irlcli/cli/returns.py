@@ -20,7 +20,7 @@ def print_rows(evaluations: Sequence[EvaluationRun], stderr: bool = False) -> No
             number(row.learned),
             str(len(row.returns)),
             str(row.episodes),
-            str(row.stopped or "-"),
+            f"{row.stopped[0]} of {row.stopped[1]}" if row.stopped[0] else "-",
         ]
         for row in rows(evaluations)
     ]

@@ -2,6 +2,8 @@
 
 import msgspec
 
+from irlcli.labels import weight_text
+
 _NAMES = {"pooled": "erm", "balanced": "erm-balanced"}
 
 
@@ -22,8 +24,8 @@ class MapMethod(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         """For example ``irmv1-full 100, labels shuffled``."""
-        text = _NAMES.get(self.grouping, f"{self.penalty} {self.penalty_weight:.12g}")
-        text += f" + l2 {self.l2:.12g}" if self.l2 else ""
+        text = _NAMES.get(self.grouping, f"{self.penalty} {weight_text(self.penalty_weight)}")
+        text += f" + l2 {weight_text(self.l2)}" if self.l2 else ""
         text += ", labels shuffled" if self.grouping == "shuffled" else ""
         text += "" if self.warm else ", no warm-up"
         return text + (", sees the texture only" if self.sees == "texture" else "")
@@ -54,4 +56,4 @@ class LabelMethod(msgspec.Struct, frozen=True):
             return f"dropout {self.dropout:g}"
         if self.penalty == "none":
             return "erm"
-        return f"{self.penalty} {self.weight:.12g}" + ", labels shuffled" * self.shuffled
+        return f"{self.penalty} {weight_text(self.weight)}" + ", labels shuffled" * self.shuffled

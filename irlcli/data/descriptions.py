@@ -24,6 +24,7 @@ from irlcli.configs.schema import AIRLConfig
 from irlcli.envs.registry import environment
 from irlcli.errors import IntegrityError, UsageError, first_line
 from irlcli.interventions import parse_setting
+from irlcli.labels import weight_text
 
 # In a dataset: reading demonstrations validates each episode by itself.
 MOST_EPISODES = 100_000
@@ -305,7 +306,8 @@ class Assessed(Struct, frozen=True, kw_only=True):
 class Assessment(Struct, frozen=True, kw_only=True):
     """``assessment.json``: a learned reward, measured on a bank of policies.
 
-    ``epic_missing`` says why there is no EPIC distance; empty if there is one.
+    ``epic_missing`` says why there is no EPIC distance; empty if there is one. ``left_out`` is how many
+    of each policy's episodes do not count, because an error stopped them for one policy.
     """
 
     env: str
@@ -314,6 +316,7 @@ class Assessment(Struct, frozen=True, kw_only=True):
     pooled: Assessed | None
     bank: tuple[BankEntry, ...]
     epic_missing: str = ""
+    left_out: Annotated[int, Meta(ge=0)] = 0
 
     def __post_init__(self) -> None:
         for s in self.settings:
@@ -382,10 +385,10 @@ class PenaltyChoice(Struct, frozen=True, kw_only=True):
             raise ValueError(f"it chose {self.chosen:g}, which is no candidate")
 
     def __str__(self) -> str:
-        tried = ",".join(f"{weight:g}" for weight in self.weights)
+        tried, chosen = ",".join(map(weight_text, self.weights)), weight_text(self.chosen)
         if self.ties > 1:
-            return f"lambda {self.chosen:g} is the smallest of {self.ties} equally good ones of {tried}"
-        return f"lambda {self.chosen:g} was the best of {tried}"
+            return f"lambda {chosen} is the smallest of {self.ties} equally good ones of {tried}"
+        return f"lambda {chosen} was the best of {tried}"
 
 
 class SettingSummary(Struct, frozen=True, kw_only=True):

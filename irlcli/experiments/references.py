@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, overload
 
 from irlcli.data import descriptions
-from irlcli.errors import NotFound, UsageError
+from irlcli.errors import IntegrityError, NotFound, UsageError
 from irlcli.experiments.inputs import foreign_source, source_in
 from irlcli.experiments.introduce import introduce
 from irlcli.interventions import Setting, check_observed, cue_in, parse_setting, without_cue
@@ -222,17 +222,21 @@ def summary(store: Store, artefact: Artefact) -> descriptions.Evaluation:
     """The summary of an evaluation.
 
     Raises:
-        UsageError: an artefact without a summary, or of another version of the stage.
-        IntegrityError: damaged.
+        UsageError: an artefact without a summary, or of an older version of the stage.
+        IntegrityError: damaged, or of a newer version.
     """
     introduce(artefact)
-    version = artefact.manifest.record.stage_version
-    if version != evaluate.STAGE.version:
-        raise UsageError(
-            f"evaluation {artefact.id} is of version {version} of its stage, and this irlcli reads version "
-            f"{evaluate.STAGE.version}",
-            f"run its command again: `irl show {artefact.id}` prints it",
+    version, known = artefact.manifest.record.stage_version, evaluate.STAGE.version
+    # Older ones averaged over episodes that an error had stopped, and did not say so.
+    if version != known:
+        message = (
+            f"evaluation {artefact.id} was made by version {version} of the stage evaluate, and this "
+            f"irlcli reads version {known}"
         )
+        if version > known:
+            raise IntegrityError(message, "a newer irlcli wrote it: upgrade irlcli to read it")
+        show = shlex.join(["irl", "show", artefact.id, *store.option])
+        raise UsageError(message, f"run its command again: `{show}` prints it")
     path = store.open(artefact, _required(artefact, "summary.json"))
     return descriptions.parse(read_json(path), descriptions.Evaluation, path)
 

@@ -3,6 +3,7 @@
 The command line and :class:`irlcli.Lab` make every artefact by ``Runner(store).run(request)``.
 """
 
+import errno
 import gc
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -54,21 +55,6 @@ class Silent(RunConsole):
     progress = warn = scalars = start = finish = found = wait = say = close = _ignore
 
 
-@contextmanager
-def _file_errors_of(label: str, store: Store) -> Iterator[None]:
-    """Report a full disk or a file that cannot be written as a failure of the stage ``label``."""
-    try:
-        yield
-    except OSError as error:
-        # A full disk names no file.
-        where = "" if error.filename else f" (store {store.root})"
-        raise StageFailed(
-            f"{label}: {file_failure(error).message}{where}",
-            "No partial output was written. Fix the problem and run the same command again: it "
-            "resumes from the last checkpoint, if there is one.",
-        ) from error
-
-
 class Runner:
     """Turns requests into artefacts of one store.
 
@@ -118,7 +104,7 @@ class Runner:
             Busy: another process computes it, or gc runs, and this runner does not wait.
             Interrupted: a signal requested a stop; the checkpoint has been saved.
         """
-        with _file_errors_of(request.label, self.store):
+        with self._file_errors_of(request.label):
             self.store.create()
             # From the first artefact that is looked up to the last one that is made from it.
             with self.store.in_use(self.wait, partial(self.console.wait, "the store")):
@@ -141,7 +127,7 @@ class Runner:
             return None
         with (
             suppress(Busy),
-            _file_errors_of(request.label, self.store),
+            self._file_errors_of(request.label),
             self.store.working_on(record.key, wait=False),
         ):
             artefact = self.store.find(record.key)
@@ -150,6 +136,20 @@ class Runner:
                 artefact = None if copied is None else copied[0]
             return artefact
         return None
+
+    @contextmanager
+    def _file_errors_of(self, label: str) -> Iterator[None]:
+        """Report a full disk or a file that cannot be written as a failure of the stage ``label``."""
+        try:
+            yield
+        except OSError as error:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            where = f" (store {self.store.root})" if full and not error.filename else ""
+            raise StageFailed(
+                f"{label}: {file_failure(error).message}{where}",
+                "No partial output was written. Fix the problem and run the same command again: it "
+                "resumes from the last checkpoint, if there is one.",
+            ) from error
 
     def _run(self, request: Request, done: dict[str, Artefact]) -> Artefact:
         """``done`` are the artefacts of this run by key: each is made or announced once."""
@@ -162,7 +162,7 @@ class Runner:
         if record.key not in done:
             artefact = self.store.find(record.key)
             if artefact is None:
-                with _file_errors_of(request.label, self.store):
+                with self._file_errors_of(request.label):
                     artefact = self._obtain(request, record, sources)
             else:
                 self.console.finish(request.label, artefact, hit=True)

@@ -102,7 +102,7 @@ def build(
     ]
     found = [
         *caveats.missing(p),
-        *caveats.stopped(points),
+        *caveats.stopped(points, assessments),
         *caveats.weak_experts(p, points, cells, assessments),
         *caveats.below_bar(p, points),
         *caveats.not_imitated(cells),

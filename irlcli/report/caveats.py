@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from irlcli.report.agents import IN_DISTRIBUTION, title
+from irlcli.report.agents import IN_DISTRIBUTION, MEASURES, title
 from irlcli.report.compute import Assessments, failed_to_imitate
 from irlcli.report.lineage import demonstrations, is_mixed, origins, short
 from irlcli.report.parameters import EXPERT_BY_REWARD, Cell, Code, Parameters, has_held_out
@@ -69,16 +69,27 @@ def not_imitated(cells: pd.DataFrame) -> list[str]:
     return found
 
 
-def stopped(points: pd.DataFrame) -> list[str]:
-    """Evaluations in which an error stopped episodes."""
+def stopped(points: pd.DataFrame, assessments: Assessments) -> list[str]:
+    """A caveat per row: evaluations and assessments in which an error stopped episodes."""
+    found: dict[str, list[str]] = {}
+    acted = points[points["measure"] != EXPERT_BY_REWARD]
+    for (row, agent, measure, setting), group in acted.groupby(
+        ["row", "agent", "measure", "setting"], sort=False
+    ):
+        if not (group["stopped"] > 0).any():
+            continue
+        what = f" {measure}" if measure in MEASURES else ""
+        counts = f"{group['stopped'].sum()} of {group['episodes'].sum()}"
+        found.setdefault(row, []).append(f"{title(agent)}{what} in {setting} {counts}")
+    for (row, method, seed), of in assessments.items():
+        if of.left_out:
+            found.setdefault(row, []).append(
+                f"assessment of {title(method)}'s reward, seed {seed}: {of.left_out} of each policy's"
+            )
     return [
-        f"Stopped by an error: {row}, {title(agent)} {measure} in {setting}: "
-        f"{group['stopped'].sum()} of {group['episodes'].sum()} episodes. The means leave them out, except "
-        "those of a policy whose episodes were all stopped."
-        for (row, agent, measure, setting), group in points.groupby(
-            ["row", "agent", "measure", "setting"], sort=False
-        )
-        if group["stopped"].any()
+        f"Episodes stopped by an error: {row}: {'; '.join(parts)}. Means leave them out. Where all of a "
+        "policy's were stopped its mean is of what came before: do not compare it."
+        for row, parts in found.items()
     ]
 
 

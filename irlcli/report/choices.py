@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from irlcli.data.descriptions import PenaltyChoice
+from irlcli.labels import weight_text
 from irlcli.report.agents import title
 from irlcli.report.parameters import Parameters
 from irlcli.report.tables import Table
@@ -55,7 +56,7 @@ def choice_table(found: pd.DataFrame) -> Table:
             row,
             title(method),
             str(seed),
-            f"{weight:g}",
+            weight_text(weight),
             number(scores["true_return"].mean()),
             ", ".join(f"{s.left_out}: {s.true_return:.1f}" for s in scores.itertuples()),
             "chosen" if scores["chosen"].any() else "",

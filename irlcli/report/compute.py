@@ -15,7 +15,8 @@ Most functions take *points*: a row per evaluation and setting with the columns
                   the policy's ceiling
     regret_error, gap_error
                   standard errors of the differences to the expert, of the true and of the learned
-                  returns, over episodes from the same start states; known of retrained policies
+                  returns, over episodes from the same start states; known of retrained policies,
+                  unless an error stopped an episode
     episodes      their number
     stopped       how many of them an error stopped; the means leave them out, unless they are all
     evaluation    id of the artefact

@@ -65,6 +65,7 @@ def summarise(
                 "length": _value(expert, "mean_length"),
                 "terminated": _value(expert, "terminated"),
                 "episodes": _value(expert, "episodes"),
+                "stopped": _value(expert, "stopped"),
                 "idle_return": _value(idle, "mean_return"),
                 "random_return": _value(random, "mean_return"),
                 "steps": steps[cell.row],
@@ -101,15 +102,24 @@ def text_table(found: pd.DataFrame) -> Table:
 
 
 def caveats(cells: Sequence[Cell], found: pd.DataFrame, bars: Mapping[str, float]) -> list[str]:
-    """Experts that do not reach the bar of their row, and missing ones."""
+    """Experts that do not reach the bar of their row, with stopped episodes, and missing ones."""
     experts = [cell for cell in cells if cell.agent == "expert"]
     missing = [f"{cell.env} {cell.setting}" for cell in experts if not cell.run]
     low = [
-        f"{row.env} {row.setting} ({row.true_return:.0f} of {bar:.0f})"
+        f"{row.env} {row.setting} ({row.true_return:.1f} of {bar:g})"
         for row in found.itertuples()
         if (bar := bars.get(f"{row.env} {row.knob}")) is not None and row.true_return < bar
     ]
     sentences = [f"Experts below their bar: {', '.join(low)}."] if low else []
+    broken = [
+        f"{row.env} {row.setting} ({row.stopped:.0f} of {row.episodes:.0f})"
+        for row in found.itertuples()
+        if row.stopped and row.stopped > 0
+    ]
+    if broken:
+        sentences.append(
+            f"Episodes stopped by an error, which the means leave out unless they are all: {', '.join(broken)}."
+        )
     if missing:
         sentences.append(
             f"Missing: the evaluations of {len(missing)} of {len(experts)} experts: {', '.join(missing)}."

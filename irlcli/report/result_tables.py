@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.stats import ttest_ind_from_stats
 
 from irlcli.data.descriptions import Verdict
-from irlcli.labels import duration, steps, steps_of_all_restarts
+from irlcli.labels import duration, steps, steps_of_all_restarts, weight_text
 from irlcli.methods import METHODS
 from irlcli.report import paper
 from irlcli.report.agents import IN_DISTRIBUTION, MEASURES, PROGRESS, beside, own_measure, title
@@ -402,9 +402,9 @@ def _weights(p: Parameters, row: Row) -> str:
     """Lambda of the config where a run has none of its own, and each run's own; ``-`` without penalty."""
     methods = (p.learned_by,) if p.variants else p.methods
     weighed = [m for m in methods if m not in METHODS or METHODS[m].penalty != "none"]
-    own = [f"{run}: {weight:g}" for run, weight in row.chosen.items()]
+    own = [f"{run}: {weight_text(weight)}" for run, weight in row.chosen.items()]
     if any(not {m, f"{m} {seed}"} & row.chosen.keys() for m in weighed for seed in p.seeds):
-        own.insert(0, f"{row.config['airl']['penalty_weight']:g}")
+        own.insert(0, weight_text(row.config["airl"]["penalty_weight"]))
     return ", ".join(own) or "-"
 
 

@@ -67,3 +67,23 @@ def against_zero_shot(p: Parameters, points: pd.DataFrame) -> pd.DataFrame:
             means = float(before[common].mean()), float(after[common].mean()), float(gain.mean())
             found.append((row.name, method, len(common), *means, int((gain > 0).sum()), paired))
     return pd.DataFrame(found, columns=columns)
+
+
+def paired_errors(policy: pd.DataFrame, expert: pd.DataFrame) -> dict[tuple[str, str], float]:
+    """Standard errors of a retrained policy's mean differences to the expert, by setting and return.
+
+    The differences are of episodes from the same start state. Where an error stopped one, the means
+    are of other episodes than the pairs: such a setting has no standard error.
+
+    Args:
+        policy, expert: ``episodes.parquet`` of an evaluation each.
+    """
+    frames = [frame.set_index(["setting", "episode", "seed"]) for frame in (policy, expert)]
+    errors = pd.concat([frame["error"] for frame in frames])
+    stopped = errors[errors != ""].index.unique("setting")
+    kinds = [
+        kind for kind in ("true_return", "learned_return") if all(kind in frame for frame in frames)
+    ]
+    of_policy, of_expert = (frame[kinds].drop(stopped, level="setting") for frame in frames)
+    # An episode that only one of them has is undefined, and sem() omits it.
+    return (of_expert - of_policy).groupby("setting").sem().stack().to_dict()

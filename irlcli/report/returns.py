@@ -31,7 +31,8 @@ class AgentRow(NamedTuple):
         returns: mean true return of each policy. One policy under several rewards is no sample of
             true returns.
         episodes: per seed.
-        stopped: how many episodes an error stopped, of all policies. The means leave them out.
+        stopped: how many episodes an error stopped, and of how many, over all policies. The means leave
+            them out, unless they are all of a policy's.
         progress: mean over policies; None if the environment reports none.
         learned: mean learned return over policies and rewards; None if no reward was given.
     """
@@ -41,7 +42,7 @@ class AgentRow(NamedTuple):
     setting: str
     returns: tuple[float, ...]
     episodes: int
-    stopped: int = 0
+    stopped: tuple[int, int] = (0, 0)
     progress: float | None = None
     learned: float | None = None
 
@@ -144,17 +145,21 @@ def _row(agent: str, env: str, setting: str, runs: Sequence[_Run]) -> AgentRow:
                 f"two runs of {agent} in {setting} have seed {which}", "name one of them"
             )
         by_seeds[seeds] = item
-    policies: dict[int | None, list[float]] = {}
+    policies: dict[int | None, list[Returns]] = {}
     for (seed, *_), item in by_seeds.items():
-        policies.setdefault(seed, []).append(item.mean_return)
+        policies.setdefault(seed, []).append(item)
+    # Scored by several rewards, a policy acted in the same episodes.
+    acted = [(of[0].stopped, of[0].episodes) for of in policies.values()]
     measured = by_seeds.values()
     return AgentRow(
         agent,
         env,
         setting,
-        returns=tuple(math.fsum(each) / len(each) for each in policies.values()),
+        returns=tuple(
+            math.fsum(item.mean_return for item in of) / len(of) for of in policies.values()
+        ),
         episodes=min(item.episodes for item in measured),
-        stopped=sum(item.stopped for item in measured),
+        stopped=(sum(n for n, _ in acted), sum(of for _, of in acted)),
         progress=_mean([item.mean_progress for item in measured]),
         learned=_mean([item.mean_learned_return for item in measured]),
     )
@@ -173,7 +178,7 @@ def as_json(evaluations: Iterable[EvaluationRun]) -> list[dict[str, Any]]:
             "mean_progress": row.progress,
             "mean_learned_return": row.learned,
             "episodes_per_seed": row.episodes,
-            "stopped": row.stopped,
+            "stopped_episodes": row.stopped[0],
         }
         for row in rows(evaluations)
     ]

@@ -68,7 +68,7 @@ def bootstrap_interval(sample: np.ndarray) -> tuple[float, float]:
     Percentile rather than BCa, which is undefined for a constant sample. Both are too narrow with
     few seeds.
     """
-    if np.ptp(sample) == 0:
+    if _constant(sample):
         return float(sample[0]), float(sample[0])
     found = stats.bootstrap(
         (sample,),
@@ -113,7 +113,7 @@ def summarise(sample: Sequence[float]) -> Sample:
     mean, iqm = float(values.mean()), interquartile_mean(values)
     if len(values) == 1:
         return Sample(1, mean, None, None, iqm)
-    deviation = float(values.std(ddof=1)) if np.ptp(values) else 0.0
+    deviation = float(values.std(ddof=1)) if not _constant(values) else 0.0
     return Sample(len(values), mean, deviation, bootstrap_interval(values), iqm)
 
 
@@ -127,7 +127,7 @@ def compare(x: Sequence[float], y: Sequence[float]) -> Comparison:
         return replace(found, why="one seed has no variance, and a test needs two seeds of each")
     rank, improvement = rank_test(a, b)
     found = replace(found, rank=rank, improvement=improvement)
-    if not np.ptp(a) and not np.ptp(b):
+    if _constant(a) and _constant(b):
         return replace(found, why="the seeds of each are equal, so the variance is zero")
     # scipy warns if one sample is constant. The tests are defined all the same.
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
@@ -170,14 +170,19 @@ def _variances(true: float, freedom: int) -> tuple[np.ndarray, np.ndarray]:
     return true * stats.chi2.ppf((points + 1.0) / 2.0, freedom) / freedom, weights / 2.0
 
 
+def _constant(values: np.ndarray, scale: float | None = None) -> bool:
+    """Whether ``values`` [n] are equal up to the rounding of numbers of size ``scale``, by default theirs."""
+    size = np.abs(values).max() if scale is None else scale
+    return bool(np.ptp(values) <= 1e-12 * size)
+
+
 def paired_p(x: Sequence[float], y: Sequence[float]) -> float | None:
     """Two-sided p of the paired t-test on ``x`` [n] and ``y`` [n], aligned by seed.
 
     None below two pairs, or if all differences are equal up to rounding.
     """
     differences = np.asarray(x, np.float64) - np.asarray(y, np.float64)
-    rounding = 1e-12 * np.abs([x, y]).max(initial=0.0)
-    if len(differences) < 2 or np.ptp(differences) <= rounding:
+    if len(differences) < 2 or _constant(differences, np.abs([x, y]).max()):
         return None
     return float(stats.ttest_rel(x, y).pvalue)
 

@@ -408,7 +408,7 @@ def warn_of_several(
     if len(knobs) > 1:
         console.warn(
             f"{' and '.join(knobs)} each have their own [{section}], and these cannot be combined: the "
-            f"environment's [{section}] is used (--settings FILE or --set changes it)"
+            f"environment's [{section}] is used; change that one with --set or --settings"
         )
 
 

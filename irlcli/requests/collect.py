@@ -63,6 +63,8 @@ def collect_experts(
     else:
         counts = _listed_counts(env, config, settings)
     experts, normalisers = arguments.experts(session.store, env, expert)
+    for own in settings if not experts else ():
+        arguments.warn_of_several(session.console, config, "expert", [without_cue(env, own)])
     request = collect_stage.request(
         env, settings, config, seed, counts, experts, trust, normalisers
     )
@@ -107,7 +109,7 @@ def warn_of_missed_bars(session: StageSession, summary: DemonstrationSummary) ->
         if bar is not None and row.mean_return is not None and row.mean_return < bar:
             session.console.warn(
                 f"the expert of {summary.env} {row.setting} is below its bar: mean true return "
-                f"{row.mean_return:.0f} over {row.episodes} episodes, bar {bar:.0f}"
+                f"{row.mean_return:.1f} over {row.episodes} episodes, bar {bar:g}"
             )
 
 

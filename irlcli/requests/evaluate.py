@@ -164,6 +164,8 @@ def _of_agent(
         # Settings that differ in their cue only have one expert.
         worlds = dict.fromkeys(without_cue(env, setting) for setting in trained)
         experts = [(world, settings) for world in worlds]
+    for own, _ in experts:
+        arguments.warn_of_several(session.console, config, "expert", [without_cue(env, own)])
     return [
         stage.request(
             env,

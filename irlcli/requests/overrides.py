@@ -42,8 +42,8 @@ def replaced(overrides: Sequence[str], requests: Iterable[Request]) -> Iterator[
         if held and _shown(field, value) not in held:
             values = " or ".join(sorted(text for text in held if text))
             yield (
-                f"--set {item} counts as {values} here: the environment or other options make it so, or "
-                "the two mean the same"
+                f"--set {item} counts as {values} here: the method, the environment or another option "
+                "decides it, or the two values mean the same"
             )
 
 

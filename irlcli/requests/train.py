@@ -47,6 +47,7 @@ def train_airl(
     source, env, texts = demonstrations(session.store, demos)
     arguments.check_env(demos, env, known)
     settings = [parse_setting(env, text) for text in texts]
+    arguments.warn_of_several(session.console, session.config(env), "airl", settings)
     if method in METHODS and not METHODS[method].learns_reward:
         of_a_reward = {
             "--grouping": grouping,
@@ -71,7 +72,6 @@ def train_airl(
     }
     config = session.config(env, flags)
     airl = config.airl_of(settings)
-    arguments.warn_of_several(session.console, config, "airl", settings)
     arguments.check_weighted(airl_stage.method_of(airl), METHODS, airl.penalty, penalty_weight)
     arguments.warn_of_weight(session.console, airl_stage.method_of(airl), airl)
     if (penalty_weight, choose_penalty) == (None, None) and not arguments.weights_set(

@@ -42,15 +42,12 @@ def extractor(normalising: bool) -> type[FlattenExtractor]:
     return NormalisingExtractor if normalising else FlattenExtractor
 
 
-class _NoOptimiser(torch.optim.Optimizer):
+def _no_optimiser(parameters: Iterable[torch.nn.Parameter], lr: float) -> None:
     """The optimiser of a policy that only acts.
 
-    SB3 gives each of its policies an optimiser, and the first optimiser of a process imports
-    PyTorch's compiler, which takes longer than a short evaluation.
+    SB3 gives each of its policies one, and the first optimiser of a process imports PyTorch's
+    compiler, which takes longer than a short evaluation.
     """
-
-    def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: float):
-        pass
 
 
 class Policy:
@@ -182,7 +179,7 @@ def _plain(
             ortho_init=False,
             features_extractor_class=extractor(description.normalise_observations),
             use_sde=description.use_sde,
-            optimizer_class=_NoOptimiser,
+            optimizer_class=_no_optimiser,  # type: ignore[arg-type]
         )
     )
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec.structs import replace
 
 from irlcli.envs.registry import environment
 from irlcli.interventions import parse_setting
@@ -73,7 +74,10 @@ def request(
 
 
 def run(job: Job) -> None:
-    """Score every recorded episode by the reward, and compare with the true returns."""
+    """Score the recorded episodes by the reward, and compare with the true returns.
+
+    Episode k counts only if an error stopped it for no policy: it is compared between them.
+    """
     import numpy as np
     import torch
 
@@ -81,11 +85,15 @@ def run(job: Job) -> None:
     from irlcli.data.tensors import load_reward_file
     from irlcli.report import scatter
     from irlcli.report.assessment import assess
+    from irlcli.trajectories import unstopped
 
     torch.set_num_threads(1)
     p: Parameters = job.parameters
     model, origin = load_reward_file(job.inputs["reward"])
-    episodes = {entry: _episodes(job, entry) for entry in p.bank}
+    recorded = {entry: _episodes(job, entry) for entry in p.bank}
+    kept = unstopped(recorded.values(), p.environment.max_episode_steps)
+    episodes = {entry: [group[k] for k in kept] for entry, group in recorded.items()}
+    left_out = len(recorded[p.bank[0]]) - len(kept)
     experts = {entry.setting: entry for entry in p.bank if entry.kind == "expert"}
 
     def returns(entry: Entry) -> np.ndarray:
@@ -111,11 +119,13 @@ def run(job: Job) -> None:
         if entry.gamma is not None and entry.setting in experts:
             gap, discounted = gaps(entry, experts[entry.setting])
             member = member._replace(ceiling=entry.ceiling, gap=gap, discounted_gap=discounted)
-        members.append(member)
-        rows += _rows(member, episodes[entry])
+        # The mean progress is that of all recorded episodes.
+        members.append(member._replace(progress=None) if left_out else member)
+        rows += _rows(member, episodes[entry], kept)
         job.console.progress(index + 1, len(p.bank), "policies", {})
     epic, epic_missing = _epic_distances(p.environment, model, origin, episodes)
     assessment = assess(p.environment.name, origin.origin, members, epic, epic_missing)
+    assessment = replace(assessment, left_out=left_out)
     write_json(job.output / "assessment.json", msgspec.to_builtins(assessment))
     write_rows(job.output / "bank.parquet", rows)
     scatter.draw_bank(job.output, assessment)
@@ -145,20 +155,22 @@ def _member(
     )
 
 
-def _rows(member: Member, episodes: Sequence[Trajectory]) -> list[dict[str, Any]]:
-    """A row per episode."""
+def _rows(
+    member: Member, episodes: Sequence[Trajectory], numbers: Sequence[int]
+) -> list[dict[str, Any]]:
+    """A row for each of ``episodes``, which have these ``numbers`` in the recording."""
     return [
         {
             "setting": member.setting,
             "policy": member.policy,
             "kind": member.kind,
-            "episode": k,
+            "episode": number,
             "true_return": float(member.true[k]),
             "learned_return": float(member.learned[k]),
             "length": len(t),
             "terminated": t.terminated,
         }
-        for k, t in enumerate(episodes)
+        for k, (number, t) in enumerate(zip(numbers, episodes, strict=True))
     ]
 
 
@@ -200,4 +212,4 @@ def _epic_distances(
     return found, ""
 
 
-STAGE = Stage("assess", 7, run, reads=("assessment",))
+STAGE = Stage("assess", 8, run, reads=("assessment",))

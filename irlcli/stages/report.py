@@ -124,11 +124,10 @@ def _points(job: Job) -> list[dict[str, Any]]:
 
 
 def _errors(job: Job, cell: Cell) -> dict[tuple[str, str], float]:
-    """Standard errors of a retrained policy's mean differences to the expert, by setting and return.
-
-    The differences are of episodes from the same start state.
-    """
+    """See :func:`irlcli.report.retrained.paired_errors`; none without the expert's evaluation."""
     import pandas as pd
+
+    from irlcli.report.retrained import paired_errors
 
     experts = (
         other.role
@@ -140,23 +139,9 @@ def _errors(job: Job, cell: Cell) -> dict[tuple[str, str], float]:
     if role is None:
         return {}
     policy, expert = (
-        _counted(pd.read_parquet(job.inputs[r] / "episodes.parquet")).set_index(
-            ["setting", "episode", "seed"]
-        )
-        for r in (cell.role, role)
+        pd.read_parquet(job.inputs[r] / "episodes.parquet") for r in (cell.role, role)
     )
-    kinds = [
-        kind for kind in ("true_return", "learned_return") if kind in policy and kind in expert
-    ]
-    # An episode that only one of them has is undefined, and sem() omits it.
-    differences = expert[kinds] - policy[kinds]
-    return differences.groupby("setting").sem().stack().to_dict()
-
-
-def _counted(episodes: pd.DataFrame) -> pd.DataFrame:
-    """As :func:`irlcli.trajectories.counted`, in each setting."""
-    whole = episodes["error"] == ""
-    return episodes[whole | ~whole.groupby(episodes["setting"]).transform("any")]
+    return paired_errors(policy, expert)
 
 
 def _episodes(job: Job) -> caveats.Episodes:
@@ -235,4 +220,4 @@ def _of_the_kept(metrics: pd.DataFrame) -> pd.DataFrame:
     return metrics[metrics["kept"]] if "kept" in metrics else metrics
 
 
-STAGE = Stage("report", 46, run)
+STAGE = Stage("report", 47, run)

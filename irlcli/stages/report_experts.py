@@ -74,4 +74,4 @@ def run(job: Job) -> None:
     experts.draw(job.output, p.cells, learning)
 
 
-STAGE = Stage("report-experts", 8, run)
+STAGE = Stage("report-experts", 9, run)

@@ -13,6 +13,7 @@ from msgspec.structs import asdict, replace
 from irlcli.configs import Config, Figure2Config, GridworldConfig, MaxEntConfig
 from irlcli.configs.relevance import relevant_maxent
 from irlcli.interventions import Setting, check_tabular
+from irlcli.labels import weight_text
 from irlcli.penalties import penalty_version
 from irlcli.stages import collect_experts
 from irlcli.stages.base import EnvironmentKey, From, Job, Request, Stage, environment_key
@@ -44,9 +45,9 @@ class SweepVariant(msgspec.Struct, frozen=True, kw_only=True):
         """For example ``erm l2 0.1`` or ``irm-shuffled irmv1 0.05``."""
         parts = [_NAMES.get(self.grouping, f"irm-{self.grouping}")]
         if self.penalty != "none":
-            parts.append(f"{self.penalty} {self.penalty_weight:.12g}")
+            parts.append(f"{self.penalty} {weight_text(self.penalty_weight)}")
         if self.l2:
-            parts.append(f"l2 {self.l2:.12g}")
+            parts.append(f"l2 {weight_text(self.l2)}")
         return " ".join(parts)
 
 

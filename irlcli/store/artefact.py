@@ -127,8 +127,9 @@ def stored_inputs(provenance: Mapping[str, Any], roles: Iterable[str]) -> list[s
 def repair_hint(directory: Path, layout: Layout) -> str:
     """How to make a damaged artefact again, in the store ``layout``."""
     command = recorded_command(directory, layout)
-    how = command or "the command that made it, whose record is lost"
-    return f"compute it again: {how}"
+    if not command:
+        return "run the command that made it again; the record of this command is lost"
+    return f"compute it again: {command}"
 
 
 def recorded_command(directory: Path, layout: Layout) -> str:

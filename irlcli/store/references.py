@@ -135,8 +135,8 @@ def _missing(layout: Layout, subject: str, id16: str) -> NotFound:
     if place is None:
         return NotFound(
             f"{subject} is missing",
-            "make it again (its command with --name), copy it from another store (`irl pull`), or give "
-            "the name to another artefact (`irl name`)",
+            "run the command that made it again, with --name; or copy it from another store (`irl pull "
+            "REF --from STORE`); or name another artefact (`irl name`)",
         )
     return NotFound(f"{subject} was damaged and is now in {place}", repair_hint(place, layout))
 

@@ -339,7 +339,6 @@ class Store:
         be computed once more.
         """
         from irlcli.store.integrity import verify
-        from irlcli.store.publish import claim
 
         verified = verify(self._layout, ids, quick)
         if not self._layout.read_only:
@@ -347,7 +346,8 @@ class Store:
                 if read.held_by(self._layout, artefact.manifest.record.key) is None:
                     lost = f"artefact {artefact.id} had lost its key"
                     try:
-                        claim(self._layout, artefact)
+                        layouts.make_directories(self._layout)
+                        self.claim(artefact)
                     except OSError as error:
                         self.warn(f"{lost}, which cannot be restored ({error.strerror})")
                     else:

@@ -387,13 +387,24 @@ def test_the_hint_of_a_lost_file_does_not_promise_more_than_there_is(irl, store_
     lost = file == "provenance.json"
     (store_copy.path / store_copy.airl / file).unlink()
     first = irl(*arguments("show airl", store_copy.path))
-    assert first.code == 4 and ("whose record is lost" in first.err) == lost
+    assert first.code == 4 and ("record of this command is lost" in first.err) == lost
     verified = irl(*arguments("verify", store_copy.path))
     assert ("made by: a command whose record is lost" in verified.err) == lost
     after = irl(*arguments("show airl", store_copy.path))
     hint = after.err.splitlines()[-1]
     assert after.code == 3
-    assert ("whose record is lost" in hint) == lost and ("irl train-airl" in hint) != lost
+    assert ("record of this command is lost" in hint) == lost
+    assert ("irl train-airl" in hint) != lost
+
+
+def test_verify_restores_the_keys_of_a_store_that_was_copied_without_them(irl, store_copy):
+    """``cp -r runs/*`` leaves out what begins with a dot."""
+    for hidden in store_copy.path.glob(".*"):
+        shutil.rmtree(hidden)
+    done = irl(*arguments("verify", store_copy.path))
+    assert done.code == 0 and "cannot be restored" not in done.err
+    line = ["transfer", "--reward", store_copy.airl, "--ood", "1.5x", "--profile", "smoke"]
+    assert irl(*line, "--store", store_copy.path, "--dry-run").out.startswith("HIT")
 
 
 def test_a_damaged_name_is_named(irl, store_copy):

@@ -554,13 +554,19 @@ def test_a_lambda_meant_for_another_penalty_is_named(irl, smoke_store, words, wa
 def test_sections_of_two_knobs_that_cannot_be_combined_are_named(
     irl, smoke_store, tmp_path, knobs, warned
 ):
-    own = "[interventions.{}.transfer]\nceiling = 0.9\n"
+    own = "[interventions.{0}.transfer]\nceiling = 0.9\n[interventions.{0}.expert]\nbar = 9.0\n"
     (tmp_path / "my.toml").write_text("".join(own.format(knob) for knob in knobs.split()))
     words = ["--settings", tmp_path / "my.toml", "--setting", "engine-power=1.5x,bounce=0.9"]
-    line = ["transfer", "--reward", "airl", *words, "--dry-run", *SMOKE]
-    done = irl(*line, "--store", smoke_store.path)
-    assert done.code == 0, done.err
-    assert ("bounce and engine-power each have their own [transfer]" in done.err) == warned
+    words += ["--dry-run", *SMOKE, "--store", smoke_store.path]
+    for line, section in (
+        (["transfer", "--reward", "airl"], "transfer"),
+        (["collect-experts", "--env", "lunar-lander"], "expert"),
+        (["evaluate", "--expert", "--env", "lunar-lander"], "expert"),
+    ):
+        done = irl(*line, *words)
+        assert done.code == 0, done.err
+        told = f"bounce and engine-power each have their own [{section}]"
+        assert done.err.count(told) == warned
 
 
 @pytest.mark.parametrize(("words", "warned"), [([], True), (["--choose-penalty", "own"], False)])

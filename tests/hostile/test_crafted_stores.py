@@ -1,7 +1,9 @@
 """Stores that somebody else wrote: planted checkpoints, links that lead out, false summaries."""
 
 import hashlib
+import json
 import os
+import shlex
 import shutil
 from pathlib import Path
 
@@ -328,8 +330,15 @@ def test_artefacts_of_another_form_have_no_part_in_a_report(empty_store, publish
 def test_an_evaluation_of_an_older_version_is_not_called_damaged(irl, empty_store, publish):
     made = publish(empty_store, {"summary.json": b"{}"}, stage="evaluate").artefact
     done = irl("report", "returns", made.id, "--store", empty_store.root)
-    assert done.code == 2 and "is of version 1 of its stage" in done.err
-    assert f"irl show {made.id}" in done.err
+    assert done.code == 2 and "by version 1 of the stage evaluate" in done.err
+    shown = shlex.split(done.err.splitlines()[-1].split("`")[1])[1:]
+    assert json.loads(irl(*shown).out)["id"] == made.id
+
+
+def test_an_evaluation_of_a_newer_version_asks_for_a_newer_program(irl, empty_store, publish):
+    made = publish(empty_store, {"summary.json": b"{}"}, stage="evaluate", version=99).artefact
+    done = irl("report", "returns", made.id, "--store", empty_store.root)
+    assert done.code == 4 and "upgrade irlcli" in done.err
 
 
 def test_an_evaluation_that_was_made_from_itself_has_its_own_circumstances(empty_store, publish):

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -309,34 +310,64 @@ def test_an_episode_that_ends_on_an_error_is_named(bench, words):
 FELL = "info = {{'error': 'it fell over'}} if {} else {{}}\n        reward = -1.0"
 
 
+def breaks(bench, when):
+    """Let a step fail ``when``. Every other one earns -1."""
+    bench.edit(bench.module, "reward = 1.0 - abs(self.position)", FELL.format(when))
+    bench.edit(bench.module, "> 5.0, False, {}", "> 5.0, False, info")
+
+
 def test_means_leave_out_episodes_that_an_error_stopped(bench):
     """On every later run, too: their table says how many there were."""
-    bench.edit(
-        bench.module, "reward = 1.0 - abs(self.position)", FELL.format("self.position > 0.0")
-    )
-    bench.edit(bench.module, "> 5.0, False, {}", "> 5.0, False, info")
-    words = ("evaluate", "--idle", "--env", "cart.toml", *ONE, "--episodes", "8")
+    breaks(bench, "self.position > 0.9")
+    # Some of the others end early.
+    bench.edit(bench.module, "abs(self.position) > 5.0", "self.position < -0.9")
+    line = ("train-airl", "--demos", "demos", "--method", "erm", "--name", "learned")
+    assert bench.irl(*COLLECT, "--intervention", "mass=1x,2x", "--name", "demos").code == 0
+    assert bench.irl(*line, "--profile", "smoke", "--quiet").code == 0
+    words = ("evaluate", "--random", *ONE, "--episodes", "12", "--reward", "learned")
     made = json.loads(bench.irl(*words, "--json").out)
     again = bench.irl(*words)
     assert "fell over" not in again.err
     directory = Path("runs", made["id"])
-    episodes = pq.read_table(directory / "episodes.parquet").to_pylist()
-    lengths = {row["error"]: row["length"] for row in episodes}
-    assert lengths["it fell over"] == 1 and lengths[""] > 1
-    stopped = sum(row["error"] != "" for row in episodes)
+    episodes = pd.read_parquet(directory / "episodes.parquet")
+    whole = episodes[episodes["error"] == ""]
+    assert set(episodes["error"]) == {"", "it fell over"} and 0 < whole["terminated"].mean() < 1
     (measured,) = json.loads((directory / "summary.json").read_text())["settings"]
-    assert (measured["episodes"], measured["stopped"]) == (8, stopped)
-    assert measured["mean_return"] == -lengths[""] == -measured["mean_length"]
+    assert (measured["episodes"], measured["stopped"]) == (12, 12 - len(whole))
+    for name, column in (
+        ("mean_return", "true_return"),
+        ("mean_learned_return", "learned_return"),
+        ("mean_length", "length"),
+        ("terminated", "terminated"),
+    ):
+        assert measured[name] == pytest.approx(whole[column].mean())
+        assert measured[name] != pytest.approx(episodes[column].mean())
     header, row = again.err.splitlines()[-2:]
-    assert "stopped by an error" in header and row.split()[-1] == str(stopped)
+    assert "stopped by an error" in header and row.endswith(f"{12 - len(whole)} of 12")
+
+
+def test_an_assessment_leaves_out_episodes_that_an_error_stopped(bench):
+    """Episode k of all policies is compared, so it is left out for all."""
+    breaks(bench, "self.position > 0.9")
+    line = ("train-airl", "--demos", "demos", "--method", "erm", "--name", "learned")
+    assert bench.irl(*COLLECT, "--intervention", "mass=1x,2x", "--name", "demos").code == 0
+    assert bench.irl(*line, "--profile", "smoke", "--quiet").code == 0
+    more = ("--name", "assessed", "--set", "evaluation.episodes=12")
+    done = bench.irl("assess", "learned", *more, "--profile", "smoke")
+    assert done.code == 0 and "are left out: an error stopped them" in done.err, done.err
+    directory = Store("runs").resolve("assessed").artefact.directory
+    bank = pd.read_parquet(directory / "bank.parquet")
+    assert (bank["terminated"] | (bank["length"] == 50)).all()
+    left_out = json.loads((directory / "assessment.json").read_text())["left_out"]
+    numbers = bank.groupby(["setting", "policy"])["episode"].agg(tuple)
+    assert numbers.nunique() == 1 and len(numbers.iloc[0]) == 12 - left_out
 
 
 def test_if_an_error_stopped_all_episodes_their_means_are_kept(bench):
-    bench.edit(bench.module, "reward = 1.0 - abs(self.position)", FELL.format("True"))
-    bench.edit(bench.module, "> 5.0, False, {}", "> 5.0, False, info")
+    breaks(bench, "True")
     words = ("evaluate", "--idle", "--env", "cart.toml", *ONE, "--episodes", "2", "--json")
     (row,) = json.loads(bench.irl(*words).out)["returns"]
-    assert (row["mean"], row["episodes_per_seed"], row["stopped"]) == (-1.0, 2, 2)
+    assert (row["mean"], row["episodes_per_seed"], row["stopped_episodes"]) == (-1.0, 2, 2)
 
 
 def test_an_error_ends_an_episode_and_progress_may_begin_later(bench):

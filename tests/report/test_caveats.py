@@ -25,12 +25,14 @@ def test_a_complete_table_has_no_caveats():
 
 def test_episodes_that_an_error_stopped():
     p, points = example(complete())
-    student = (points["row"] == BOUNCE) & (points["agent"] == "erm") & (points["seed"] == 1)
-    points.loc[student & (points["measure"] == "zero-shot"), "stopped"] = 3
+    at_bounce, agent = points["row"] == BOUNCE, points["agent"]
+    students = at_bounce & (agent == "erm") & (points["measure"] == "zero-shot")
+    points.loc[students & (points["seed"] == 1), "stopped"] = 3
+    points.loc[at_bounce & (agent == "idle"), "stopped"] = 2
     (caveat,) = build(p, points, {}, {}).caveats
-    assert caveat.startswith(
-        f"Stopped by an error: {BOUNCE}, AIRL-ERM zero-shot in bounce=0.9: 3 of 60"
-    )
+    assert caveat.startswith(f"Episodes stopped by an error: {BOUNCE}: ")
+    assert "AIRL-ERM zero-shot in bounce=0.9 3 of 60" in caveat
+    assert "idle in bounce=0.9 2 of 20" in caveat
 
 
 def test_a_student_that_did_not_imitate():

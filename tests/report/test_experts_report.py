@@ -18,7 +18,7 @@ CELLS = (
 RUNS = {"a": run_of(0, inputs=("e",)), "e": run_of(1, "train-expert"), "r": run_of(2)}
 
 
-def returns(mean):
+def returns(mean, stopped=0):
     return SimpleNamespace(
         mean_return=mean,
         std_return=5.0,
@@ -26,6 +26,7 @@ def returns(mean):
         mean_length=300.0,
         terminated=20,
         episodes=20,
+        stopped=stopped,
     )
 
 
@@ -54,7 +55,14 @@ def test_caveats_name_missing_experts_and_those_below_their_bar(bar, low):
     found = experts.caveats(CELLS, summarised(), {ROW: bar, "lunar-lander friction": 999.0})
     assert found[-1] == "Missing: the evaluations of 1 of 2 experts: lunar-lander bounce=0.9."
     assert len(found) == 1 + low
-    assert not low or "bounce=0.1 (250 of 260)" in found[0]
+    assert not low or "bounce=0.1 (250.0 of 260)" in found[0]
+
+
+def test_episodes_of_an_expert_that_an_error_stopped_are_counted():
+    evaluated = {("expert", "lunar-lander", "bounce=0.1"): returns(250.0, stopped=3)}
+    table = experts.summarise(CELLS, RUNS, {ROW: 1000}, evaluated)
+    found = experts.caveats(CELLS, table, {})
+    assert any("stopped by an error" in c and "bounce=0.1 (3 of 20)" in c for c in found)
 
 
 def test_an_intervention_may_hold_no_value_out(tmp_path):

@@ -10,6 +10,7 @@ from report_examples import BOUNCE, cell, column, complete, example, table
 from irlcli.data.descriptions import RewardOrigin
 from irlcli.report.assessment import assess
 from irlcli.report.build import as_json, build
+from irlcli.report.retrained import paired_errors
 from irlcli.report.reward_quality import Member
 
 MEASURES = ("transfer", "from-student", "transfer-id", "zero-shot", "id")
@@ -181,3 +182,23 @@ def test_a_budget_that_training_may_leave_unused_is_an_upper_limit():
     p = replace(p, rows=(replace(first, config=early), second))
     shown = table(build(p, points, {}, {}), "Budgets")
     assert column(shown, "AIRL steps") == ["at most 2,000", "2,000"]
+
+
+def test_a_difference_has_no_standard_error_where_an_error_stopped_an_episode():
+    """The means are then of other episodes than the pairs."""
+
+    def episodes(returns, errors):
+        rows = enumerate(zip(returns, errors, strict=True))
+        return pd.DataFrame(
+            [
+                {"setting": setting, "episode": k, "seed": k, "true_return": value + k}
+                | {"error": error if setting == "b" else ""}
+                for k, (value, error) in rows
+                for setting in ("a", "b")
+            ]
+        )
+
+    policy = episodes([0.0, 100.0, 101.0], ["", "", ""])
+    for errors in (["", "fell", ""], ["fell"] * 3):
+        found = paired_errors(policy, episodes([50.0, 100.0, 102.0], errors))
+        assert found == {("a", "true_return"): pytest.approx(np.std([50, 0, 1], ddof=1) / 3**0.5)}

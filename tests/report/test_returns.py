@@ -41,7 +41,19 @@ def test_statistics_are_over_seeds():
 
 def test_episodes_that_an_error_stopped_are_added_up():
     (row,) = rows([evaluation("expert", 0.0, k, stopped=n) for k, n in enumerate((2, 0, 5))])
-    assert row.stopped == 7
+    assert row.stopped == (7, 60)
+
+
+def test_a_policy_under_several_rewards_acted_once():
+    under = [
+        msgspec.structs.replace(
+            evaluation("expert", 0.0, 0, stopped=2)[0],
+            reward=RewardOrigin(settings=("bounce=0.1",), seed=k, method="erm"),
+        )
+        for k in range(3)
+    ]
+    (row,) = rows([(summary, {}, False) for summary in under])
+    assert row.stopped == (2, 20)
 
 
 def test_a_row_has_the_fewest_episodes_of_its_seeds():
